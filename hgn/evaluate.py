@@ -19,6 +19,7 @@ from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
 from hgn.schema import Bounded, FileName, NonNegative, Positive, from_mapping
 from hgn.system.files import require_place, write_json
+from hgn.system.loading import loading
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
@@ -42,10 +43,11 @@ class EvaluateConfig(SimulatorConfig, Bounded):
 
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON if `json` is set. Returns the exit code."""
-    from hgn.runtime.simulator import InitialState, Simulator
-    from hgn.runtime.weights import find_weights, require_frame_rate
-    from hgn.system.provenance import provenance
-    from hgn.training.errors import set_convention
+    with loading():
+        from hgn.runtime.simulator import InitialState, Simulator
+        from hgn.runtime.weights import find_weights, require_frame_rate
+        from hgn.system.provenance import provenance
+        from hgn.training.errors import set_convention
 
     config = from_mapping(EvaluateConfig, mapping)
     if config.json is not None:

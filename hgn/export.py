@@ -18,6 +18,7 @@ from hgn.schema import FileName, FolderName, NonNegative, Positive, from_mapping
 from hgn.step_config import StepConfig, WallClearance
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
+from hgn.system.loading import loading
 
 if TYPE_CHECKING:
     from hgn.network.base import ParticleNetwork
@@ -64,10 +65,11 @@ class ExportConfig:
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes the files that the settings name. Returns the exit code."""
-    from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
-    from hgn.runtime.simulator import InitialState, Simulator
-    from hgn.runtime.weights import find_weights, load_weights
-    from hgn.system.device import choose_device
+    with loading():
+        from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
+        from hgn.runtime.simulator import InitialState, Simulator
+        from hgn.runtime.weights import find_weights, load_weights
+        from hgn.system.device import choose_device
 
     config = from_mapping(ExportConfig, mapping)
     if config.onnx is not None:

@@ -18,6 +18,7 @@ from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import FileName, Port, Positive, from_mapping, require, require_bounds
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
+from hgn.system.loading import loading
 
 if TYPE_CHECKING:
     from hgn.runtime.simulator import Simulator
@@ -65,11 +66,12 @@ def play_page(config: PlayConfig) -> Any:
     """Returns a `hgn.viewer.page.PlayPage` of a scene. Raises ConfigError as loading and simulating the scene do."""
     path = find_scene(config.scene)
     scene = load_scene(path)  # before PyTorch and the weights, so that a mistake in it is answered early
-    from hgn.runtime.simulator import Simulator
-    from hgn.runtime.weights import shipped_weights
-    from hgn.system.device import choose_device
-    from hgn.viewer.page import PlayPage
-    from hgn.viewer.session import PlaySession
+    with loading():
+        from hgn.runtime.simulator import Simulator
+        from hgn.runtime.weights import shipped_weights
+        from hgn.system.device import choose_device
+        from hgn.viewer.page import PlayPage
+        from hgn.viewer.session import PlaySession
 
     place = choose_device(config.device)
 

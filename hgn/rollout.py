@@ -36,6 +36,7 @@ from hgn.schema import (
     require_replaceable,
 )
 from hgn.system.files import require_place
+from hgn.system.loading import loading
 from hgn.system.processes import ended_as_by_ctrl_c
 from hgn.system.progress import bar
 
@@ -119,11 +120,12 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     The file of an episode also has the episode's true positions. Ctrl-C and a simulation that diverges keep the frames
     so far, which a line reports. Raises ConfigError for bad input or a simulation that diverges.
     """
-    from hgn.render.exchange import require_exchange, save_frames
-    from hgn.runtime.simulator import InitialState, Simulator
-    from hgn.runtime.weights import find_weights, require_frame_rate
-    from hgn.scene.episode_obstacles import obstacles_of_episode
-    from hgn.scene.rollout_file import Rollout
+    with loading():
+        from hgn.render.exchange import require_exchange, save_frames
+        from hgn.runtime.simulator import InitialState, Simulator
+        from hgn.runtime.weights import find_weights, require_frame_rate
+        from hgn.scene.episode_obstacles import obstacles_of_episode
+        from hgn.scene.rollout_file import Rollout
 
     out = _out(config)
     require_exchange(out, config.surface)

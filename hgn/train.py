@@ -15,6 +15,7 @@ from hgn.command import run_command
 from hgn.config import TrainConfig
 from hgn.schema import ConfigError, from_mapping, printable, require, require_replaceable
 from hgn.system.extras import missing_extra, require_installed
+from hgn.system.loading import loading
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
 from hgn.system.ranks import first_on_machine, first_rank
@@ -26,18 +27,25 @@ if TYPE_CHECKING:
 
 def main(mapping: dict[str, Any]) -> int:
     """Trains with the resolved configuration. Returns the exit code."""
-    import torch
+    with loading():
+        import torch
 
-    from hgn.data.identity import require_same_dataset
-    from hgn.data.manifest import Manifest
-    from hgn.data.reader import EpisodeStore
-    from hgn.data.storage import is_remote
-    from hgn.training.dataset import PublishedEpisodes, missing_scenes, more_data, wait_for_episodes, warning_on_a_cpu
-    from hgn.training.distributed import default_run, layout
-    from hgn.training.generator import Generator
-    from hgn.training.imported import require_network_fits, settings_of_imported
-    from hgn.training.session import Start, precompile_kernels, train_network
-    from hgn.training.stop import StopRequest
+        from hgn.data.identity import require_same_dataset
+        from hgn.data.manifest import Manifest
+        from hgn.data.reader import EpisodeStore
+        from hgn.data.storage import is_remote
+        from hgn.training.dataset import (
+            PublishedEpisodes,
+            missing_scenes,
+            more_data,
+            wait_for_episodes,
+            warning_on_a_cpu,
+        )
+        from hgn.training.distributed import default_run, layout
+        from hgn.training.generator import Generator
+        from hgn.training.imported import require_network_fits, settings_of_imported
+        from hgn.training.session import Start, precompile_kernels, train_network
+        from hgn.training.stop import StopRequest
 
     require_installed("lightning")
     name = mapping.pop("name", "unnamed")

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_714,
-    "datagen": 8_984,
+    "hgn": 33_749,
+    "datagen": 8_987,
     "tools": 6_353,
-    "tests": 34_120,
+    "tests": 34_132,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

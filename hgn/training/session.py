@@ -27,6 +27,7 @@ from hgn.scene.own_physics import own_ranges
 from hgn.schema import printable, to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
+from hgn.system.loading import loading
 from hgn.system.provenance import provenance, with_texts
 from hgn.system.ranks import first_on_machine, first_rank
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo, Resume
@@ -56,15 +57,16 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     `published` reports how many episodes are published. Every rank calls this function.
     """
     # Importing Lightning takes seconds. It is imported after the wait for data, and by no other command.
-    from hgn.training import lightning_compat
-    from hgn.training.callbacks import Checkpoints, LogLines, SameWeights, Stopper
-    from hgn.training.checkpoint_writer import CheckpointWriter
-    from hgn.training.data_module import EpisodeDataModule
-    from hgn.training.loggers import build_loggers
-    from hgn.training.monitor import Monitor
-    from hgn.training.readers import ChunkReader, EpisodeReader, WindowReader
-    from hgn.training.tensorboard import FinalMetrics
-    from hgn.training.watch import RankWatch, record_collectives
+    with loading():
+        from hgn.training import lightning_compat
+        from hgn.training.callbacks import Checkpoints, LogLines, SameWeights, Stopper
+        from hgn.training.checkpoint_writer import CheckpointWriter
+        from hgn.training.data_module import EpisodeDataModule
+        from hgn.training.loggers import build_loggers
+        from hgn.training.monitor import Monitor
+        from hgn.training.readers import ChunkReader, EpisodeReader, WindowReader
+        from hgn.training.tensorboard import FinalMetrics
+        from hgn.training.watch import RankWatch, record_collectives
 
     training, run, store, resume = config.training, Path(config.run), start.store, start.resume
     lightning_compat.quieten()

@@ -23,17 +23,24 @@ TRAINING_STACK = (
 # for writing PLY, graphs, and compiled or exported networks
 OTHER_JOBS = ("trimesh", "networkx", "scipy.optimize", "torch._dynamo", "torch.onnx")
 PROGRAM = """
-import json, sys
+import gc, json, sys
 import hgn
 assert not {"torch", "numpy"} & sys.modules.keys()
-from hgn import Simulator, load_scene
-
-weights, scene = sys.argv[1:]
-(path,) = Simulator.load(weights).rollout([load_scene(scene)], 3)
-
 from hgn.rollout import RolloutConfig, rollout
 
+def note(*_):
+    if "torch" in sys.modules and sys.modules["torch"].__spec__._initializing:
+        searches.append(len(sys.modules))
+
+searches = []
+gc.callbacks.append(note)
+weights, scene = sys.argv[1:]
 rollout(RolloutConfig(weights=weights, scene=scene, frames=3, out="path.vtkhdf"))
+assert not searches and gc.isenabled(), f"{len(searches)} searches for garbage in PyTorch's modules"
+
+from hgn import Simulator, load_scene
+
+(path,) = Simulator.load(weights).rollout([load_scene(scene)], 3)
 print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
 """
 
@@ -78,11 +85,16 @@ def test_lightning_without_metrics(tmp_path):
     assert [name for name in ("torchmetrics", "scipy.signal", "matplotlib") if f"'{name}'" in loaded] == []
 
 
-def test_pages_load_no_meshes(tmp_path):
-    """hgn.play imports no package that only other jobs need."""
-    pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
-    loaded = printed_by("import sys, hgn.viewer.page; print(sorted(sys.modules))", folder=tmp_path)
-    assert [name for name in OTHER_JOBS if f"'{name}'" in loaded] == []
+@pytest.mark.parametrize(
+    ("module", "needs", "unused"),
+    [("hgn.viewer.page", "viser", OTHER_JOBS), ("datagen.mpm.solver", "taichi", ("scipy", "urllib3", "torch"))],
+)
+def test_workers_and_pages(tmp_path, module, needs, unused):
+    """A page of hgn.play and a solver of datagen import no package that only other jobs need."""
+    pytest.importorskip(needs)
+    program = f"import sys, warnings; warnings.simplefilter('ignore'); import {module}; print(sorted(sys.modules))"
+    loaded = printed_by(program, folder=tmp_path)
+    assert [name for name in unused if f"'{name}'" in loaded] == []
 
 
 def printed_by(program, *arguments, folder):
