@@ -107,7 +107,7 @@ def test_live(here):
 def test_gradients(here):
     """Gradients through a simulation: the examples, with few frames and one step."""
     fewer = {f"scene, {frames}, ": "scene, 2, " for frames in (10, 21)}
-    fewer |= {"range(10)": "range(1)", ", 40, poses": ", 8, poses", "starts, 60)": "starts, 2)"}
+    fewer |= {"range(10)": "range(1)", ", 26, poses": ", 8, poses", "starts, 60)": "starts, 2)"}
     runner = Runner(SETTINGS, fewer | {"range(-60, 61, 4)": "range(-60, 61, 120)"})
     runner.run(ROOT / "docs/how_to/gradients.md")
     assert runner.names["velocity_3"].shape == (3,) and runner.names["angles"] == [20.0]
