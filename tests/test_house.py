@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_749,
+    "hgn": 33_751,
     "datagen": 8_987,
     "tools": 6_353,
-    "tests": 34_132,
+    "tests": 34_146,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
@@ -40,7 +40,6 @@ UNMENTIONED: set[str] = set()
 BYTES_OF_A_FILE = 500_000
 LARGE_FILES = {  # shipped weights, and results that pages show
     "hgn/weights/mechanics.safetensors",
-    "hgn/weights/obstacles.safetensors",
     "hgn/weights/obstacles_small.safetensors",
     "hgn/weights/own_physics.safetensors",
     "results/stability/network_h100.json",

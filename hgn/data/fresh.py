@@ -41,7 +41,7 @@ def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
             f"frozen[{i}]",
             "an existing file of weights",
             str(file),
-            "as in hgn/weights/obstacles.safetensors",
+            "as in hgn/weights/mechanics.safetensors",
         )
     hashes = {file.name: file_sha256(file) for file in files}
     fresh = read_fresh(folder)

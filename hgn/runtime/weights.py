@@ -16,7 +16,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, config_directory
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import current_names, with_step
@@ -86,7 +86,8 @@ def shipped_weights() -> dict[str, Path]:
 def find_weights(name: str, field: str = "weights") -> Path:
     """Returns the weights file for a shipped name, a repository (hf://) or a path.
 
-    Raises: ConfigError for a name that is neither shipped nor looks like a path.
+    Raises: ConfigError for a name that is neither shipped nor looks like a path; it names the command that trains such
+    weights, if the name is an experiment's.
     """
     shipped = shipped_weights()
     if name in shipped:
@@ -96,8 +97,10 @@ def find_weights(name: str, field: str = "weights") -> Path:
         return hub_weights(name, field)
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path
-    names = ", ".join(shipped) or "none in this copy"
-    require(False, field, f"a file or the name of shipped weights ({names})", name, remedy=near_name(name, shipped))
+    names, remedy = ", ".join(shipped) or "none in this copy", near_name(name, shipped)
+    if name in {path.stem for path in (config_directory() / "experiment").glob("*.yaml")}:
+        remedy = f"take one of these, or train with python -m hgn.train +experiment={name}"
+    require(False, field, f"a file or the name of shipped weights ({names})", name, remedy=remedy)
     raise AssertionError
 
 

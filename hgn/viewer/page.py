@@ -41,9 +41,8 @@ MAXIMUM_UPLOAD_BYTES = 64 << 20
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
 ABOUT = {
     "mechanics": "any motion and gravity; a body alone flies exactly",
-    "obstacles": "scenes that start at rest, gravity 9.8 downwards",
     "own_physics": "pools, dams, slopes, small and large bodies; resting material creeps",
-    "obstacles_small": "fast on a CPU, as obstacles with larger errors: some particles float or pass obstacles",
+    "obstacles_small": "fast on a CPU; starts at rest, gravity 9.8 downwards; some particles float or pass obstacles",
 }
 HELP = """
 **Shift + drag** on the floor pours, **Shift + click** drops a ball.

@@ -102,7 +102,7 @@ VALUES = [
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
     ("export", ["out=x"], "checkpoint must be given, or else weights, got None"),
     ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
-    ("rollout", ["--weights=obstacles"], "--weights=obstacles is not an option; settings are given as weights=obs"),
+    ("rollout", ["--weights=mechanics"], "--weights=mechanics is not an option; settings are given as weights=mec"),
     ("train", ["--resume"], "--resume is not an option; settings are given as KEY=VALUE; --help shows the keys"),
     ("rollout", ["scene.yaml"], "settings are given as KEY=VALUE, got 'scene.yaml'; --help shows the keys"),
     *(

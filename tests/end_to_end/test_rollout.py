@@ -1,5 +1,6 @@
 """python -m hgn.rollout where little is said: shipped weights, random scenes, examples by name, pictures."""
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_we
 from hgn.scene.rollout_file import read_rollout
 from hgn.schema import ConfigError
 
-MAXIMUM_BYTES = 8_000_000
+MAXIMUM_BYTES, ALL_BYTES = 8_000_000, 20_000_000
 
 
 @pytest.fixture
@@ -32,8 +33,9 @@ def weights(tmp_path):
 
 
 def test_shipped_weights_are_whole():
-    """Each shipped file loads, is small enough to ship, and has a card that names it."""
-    assert {"mechanics", "obstacles"} <= set(shipped_weights())
+    """Each shipped file loads, is small enough to ship, as all are together, and has a card that names it."""
+    assert set(shipped_weights()) == {"mechanics", "obstacles_small", "own_physics"}
+    assert sum(path.stat().st_size for path in shipped_weights().values()) <= ALL_BYTES
     for name, path in shipped_weights().items():
         assert find_weights(name) == path and path.stat().st_size <= MAXIMUM_BYTES
         _, info = load_weights(path)
@@ -42,14 +44,20 @@ def test_shipped_weights_are_whole():
 
 
 def test_names_and_paths(tmp_path, monkeypatch):
-    """A path stays a path, whether there is such a file or not; an unknown name lists what is shipped."""
+    """A path stays a path, whether there is such a file or not; an unknown name lists what is shipped. Weights that
+    only an experiment makes are answered with its command."""
     monkeypatch.chdir(tmp_path)
     Path("mine").touch()
     for path in ("mine", "missing.safetensors", "folder/missing"):
         assert find_weights(path) == Path(path)
-    message = r"weights must be a file or .* shipped weights \(.*obstacles.*\), got 'sand'"
-    with pytest.raises(ConfigError, match=message):
-        find_weights("sand")
+    shipped = "weights must be a file or the name of shipped weights (mechanics, obstacles_small, own_physics), got "
+    for name, message in (
+        ("sand", "'sand'"),
+        ("obstacle_small", "'obstacle_small'; did you mean obstacles_small?"),
+        ("obstacles", "'obstacles'; take one of these, or train with python -m hgn.train +experiment=obstacles"),
+    ):
+        with pytest.raises(ConfigError, match=f"^{re.escape(shipped + message)}$"):
+            find_weights(name)
 
 
 def test_nothing_said(tmp_path, small_pictures, monkeypatch, capsys):

@@ -1,5 +1,6 @@
 """The queue of one machine: its GPUs share a list, barriers hold, it stops and goes on; and the lists of networks."""
 
+import json
 import os
 import signal
 import subprocess
@@ -295,8 +296,8 @@ def trained_and_scored(name, configs, data):
 
 def test_networks(listed):
     """jobs/networks.txt: each command's settings compose to a valid configuration; each network is trained on data that
-    an earlier line makes, exported, and scored on the same data; the shipped networks of absolute inputs are among
-    them; reports take what was exported."""
+    an earlier line makes, exported, and scored on the same data; the paper's network and the shipped ones of
+    absolute inputs are among them; reports take what was exported."""
     data: dict[str, DatagenConfig] = {}
     exported: dict[str, str] = {}  # weights to data
     reported: set[str] = set()
@@ -312,7 +313,8 @@ def test_networks(listed):
             assert config.dataset.training_scenes == 800 and score.data == config.dataset.folder
             exported[score.weights] = score.data
     assert reported == set(exported)
-    assert set(shipped_weights()) - {"mechanics", "own_physics"} <= {Path(file).stem for file in exported}
+    shipped = set(shipped_weights()) - {"mechanics", "own_physics"}
+    assert shipped | {"obstacles"} <= {Path(file).stem for file in exported}
 
 
 def test_mechanics(listed):
@@ -370,9 +372,12 @@ def test_judged(listed):
 
 def test_pushforward(listed):
     """jobs/pushforward.txt: it begins with weights that jobs/networks.txt exports; each training goes on from weights
-    that are there, on data that an earlier line makes; means are of weights that are there, and the last one ships."""
+    that are there, on data that an earlier line makes; means are of weights that are there, and the last one is of the
+    network that results compare."""
     data: dict[str, DatagenConfig] = {}
-    there, trained = {"runs/obstacles/obstacles.safetensors"}, set[str]()
+    begun = "runs/obstacles/obstacles.safetensors"
+    assert listed("networks.txt")["obstacles"]["hgn.export"].out == begun
+    there, trained = {begun}, set[str]()
     for name, configs in listed("pushforward.txt").items():
         if "datagen" in configs:
             data[configs["datagen"].dataset.folder] = configs["datagen"]
@@ -385,8 +390,10 @@ def test_pushforward(listed):
             assert config.training.init_weights in there and score.data == "data/obstacles"
             trained.add(config.dataset.folder)
             there.add(score.weights)
-    assert trained == set(data) and name == "shipped"
-    assert mean.out == configs["hgn.evaluate"].weights and Path(mean.out).stem in shipped_weights()
+    assert trained == set(data) and name == "mean"
+    reported = json.loads((JOBS.parent / "results/error_vs_time/chosen.json").read_text())["rows"]
+    assert mean.out == configs["hgn.evaluate"].weights
+    assert Path(mean.out).name in {row.get("weights") for row in reported}
 
 
 @pytest.mark.parametrize(("file", "lines"), [("networks.txt", 10), ("mechanics.txt", 31), ("pushforward.txt", 8)])

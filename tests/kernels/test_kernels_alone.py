@@ -203,8 +203,8 @@ def test_inference(precision, half_cells, half_sums, table):
 @pytest.mark.skipif(not NATIVE, reason="the same kernels as in test_several_scenes, of width 128")
 @pytest.mark.parametrize("precision", ["tf32", "fp16"])
 def test_a_trained_network(precision, table):
-    """The shipped one, of width 128, with four iterations on each of four levels."""
-    network, _ = load_weights(find_weights("obstacles"))
+    """A shipped one, of width 128, with two iterations on each of four levels."""
+    network, _ = load_weights(find_weights("obstacles_small"))
     assert isinstance(network, HierarchicalGraphNetwork)
     judge, state = Judge(table, precision), float32_state((300, 131), spread=0.2)
     judged(judge, made(network.double(), state, precision, ROOM), network, state)

@@ -265,9 +265,9 @@ def test_onnx_runs_in_cpp(as_onnx):
         ({"checkpoint": "a"}, "out must be given with checkpoint, got None"),
         ({"checkpoint": "a", "weights": "gns"}, "weights must be null with checkpoint, got 'gns'"),
         ({"weights": "gns"}, "out must be given with weights, or onnx, package or arrays, got None"),
-        ({"weights": "obstacles", "package": "a.so"}, "package must be a name that ends in .pt2, got 'a.so'"),
-        ({"weights": "obstacles", "arrays": "", "scene": "a"}, "arrays must be a folder name, got ''"),
-        ({"weights": "obstacles", "arrays": "a"}, "scene must be given with arrays, and only then, got None"),
+        ({"weights": "obstacles_small", "package": "a.so"}, "package must be a name that ends in .pt2, got 'a.so'"),
+        ({"weights": "obstacles_small", "arrays": "", "scene": "a"}, "arrays must be a folder name, got ''"),
+        ({"weights": "obstacles_small", "arrays": "a"}, "scene must be given with arrays, and only then, got None"),
     ],
 )
 def test_what_is_refused(options, message):

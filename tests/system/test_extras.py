@@ -54,10 +54,10 @@ FOREIGN = {"bounds": [[0, 1]] * 3, "sequence_length": 10, "default_connectivity_
         ("viser", "hgn.play", {}),
         ("pxr", "hgn.rollout", {"out": "water.usdc"}),
         ("pysplashsurf", "hgn.rollout", {"out": "water.ply", "surface": True}),
-        ("onnxscript", "hgn.export", {"weights": "obstacles", "onnx": "step.onnx"}),
+        ("onnxscript", "hgn.export", {"weights": "obstacles_small", "onnx": "step.onnx"}),
         ("google_crc32c", "hgn.import_trajectories", {"from": "../foreign", "out": "mine"}),
         ("huggingface_hub", "hgn.rollout", {"weights": "hf://name/weights"}),
-        ("s3fs", "hgn.evaluate", {"weights": "obstacles", "data": "s3://bucket/set"}),
+        ("s3fs", "hgn.evaluate", {"weights": "obstacles_small", "data": "s3://bucket/set"}),
     ],
 )
 def test_what_is_optional_names_its_extra(tmp_path, monkeypatch, package, module, settings):
