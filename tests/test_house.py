@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_751,
     "datagen": 8_987,
     "tools": 6_353,
-    "tests": 34_146,
+    "tests": 34_149,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

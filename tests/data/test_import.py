@@ -10,6 +10,7 @@ import pytest
 import torch
 from data.foreign_writers import metadata, pickled_npz, write
 from PIL import Image
+from scene.test_episode import members_of
 from training.runs import metrics, train_mapping
 
 from hgn import evaluate, import_trajectories, train
@@ -27,7 +28,7 @@ from hgn.render.pictures import compare_picture
 from hgn.rollout import RolloutConfig, rollout
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights
-from hgn.scene.episode import decode_episode, encode_episode
+from hgn.scene.episode import decode_episode
 from hgn.scene.history import frames_before, window
 from hgn.scene.rollout_file import read_rollout
 from hgn.schema import ConfigError
@@ -77,7 +78,7 @@ def test_own_episodes_come_back(name, data, tmp_path):
             assert one.count == two.count and one.mean == pytest.approx(two.mean, rel=1e-12)
             assert torch.equal(torch.tensor(one.std), torch.tensor(two.std))
     (first, *_) = EpisodeStore(tmp_path / "mine", "train")
-    again = decode_episode(first.key, encode_episode(first))
+    again = decode_episode(first.key, members_of(first))
     assert again.past_HN3 is not None and np.array_equal(again.past_HN3, first.past_HN3)
 
 

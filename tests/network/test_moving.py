@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 from network.states import airborne, network_of
+from scene.test_episode import members_of
 from training.test_symmetry import ALL_48
 
 from hgn.config import SceneConfig
@@ -17,7 +18,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.differentiable import Pose
 from hgn.runtime.live import LiveSimulation
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.episode import Episode, decode_episode, encode_episode
+from hgn.scene.episode import Episode, decode_episode
 from hgn.scene.motion import Motion
 from hgn.scene.moving import at_rest, moving_obstacles
 from hgn.scene.obstacle_grid import build_obstacle_grid
@@ -169,7 +170,7 @@ def test_data_have_the_obstacles_of_a_simulation():
         path_TN3, solver = np.repeat(scene.position_N3[None], 60, 0), {"settings": {"collider_friction": 0.0}}
         values = (scene.velocity_N3, scene.material_N, grid, scene.domain_size, scene.gravity, 60.0, scene.seed)
         episode = Episode("a", path_TN3, *values, scene.specification, solver)
-        batch = make_batch([(decode_episode("a", encode_episode(episode)), 40)], network.config)
+        batch = make_batch([(decode_episode("a", members_of(episode)), 40)], network.config)
         started = Simulator(network, 60.0, "torch").start([scene]).moving.at([40])
         for mine, other in zip(batch.moving.poses.tensors, started.poses.tensors, strict=True):
             torch.testing.assert_close(mine, other, rtol=0, atol=0)

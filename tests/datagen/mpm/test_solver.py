@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import shared_kernels
 from mpm_scenes import CELL, CONFIG, assert_inside, block, joined, particles, sheet, simulated
+from scene.test_episode import members_of
 
 from datagen.mpm import launch
 from datagen.mpm.device import initialise
@@ -16,7 +17,7 @@ from datagen.mpm.solver import SceneFailure, particle_bounds, simulate
 from datagen.pool.plan import SceneTask
 from datagen.pool.worker import Backend, make_episode, make_scene, simulate_batch
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
-from hgn.scene.episode import decode_episode, encode_episode
+from hgn.scene.episode import decode_episode
 from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
 from hgn.schema import ConfigError
 
@@ -282,7 +283,7 @@ def test_an_episode_keeps_its_scenes_gravity(gravity):
     answer, made = make_scene(SceneTask("train", 0, 0, 3), config, Backend())
     assert answer == "made"
     (result,) = simulate_batch([made], config, Backend(), 2)
-    stored = encode_episode(make_episode(made, result, config, "0" * 64))
+    stored = members_of(make_episode(made, result, config, "0" * 64))
     episode = decode_episode("train-000000", stored)
     assert episode.gravity == gravity
     time_T1 = np.arange(4)[:, None] / 60
