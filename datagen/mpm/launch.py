@@ -7,6 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -348,35 +349,41 @@ class Launch(ABC):
         completed so far [B].
         """
 
-    def run(self, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
-        """Returns the frames of each scene, the initial state included, or why the scene was stopped."""
-        trajectory = [np.empty((frames, scene.particle_count, 3), np.float32) for scene in self.scenes]
-        absent = []
-        for rows, scene, begin in zip(trajectory, self.scenes, self.particle_begin, strict=False):
-            rows[0] = scene.position_N3
-            absent.append(np.arange(frames)[:, None] < self.entry_frame[begin : begin + scene.particle_count])
+    def run(self, frames: int, on_frame: Callable[[int], None] | None, children: int) -> list[Simulated | SceneFailure]:
+        """Returns the frames of each scene, the initial state included, or why the scene was stopped.
+
+        Trajectories contain the first of each `children` particles, counters count all particles.
+        """
+        every = [slice(*pair) for pair in pairwise(self.particle_begin)]
+        first = [slice(particles.start, particles.stop, children) for particles in every]
+        trajectory = [np.empty((frames, len(self.entry_frame[visible]), 3), np.float32) for visible in first]
+        for rows, scene in zip(trajectory, self.scenes, strict=True):
+            rows[0] = scene.position_N3[::children]
+        last = np.concatenate([scene.position_N3 for scene in self.scenes])
         if on_frame is not None:
             on_frame(0)
         present, completed = 1, np.zeros(len(self.scenes), np.int64)
         for position, completed in self._advance(frames - 1):
-            for rows, begin in zip(trajectory, self.particle_begin, strict=False):
-                rows[present : present + len(position)] = position[:, begin : begin + rows.shape[1]]
+            for rows, visible in zip(trajectory, first, strict=True):
+                rows[present : present + len(position)] = position[:, visible]
             for frame in range(present, present + len(position)):
                 if on_frame is not None:
                     on_frame(frame)
             present += len(position)
+            last[:] = position[-1]
             if (completed < present - 1).all():
                 break
-        for rows, gone in zip(trajectory, absent, strict=True):
-            rows[gone] = np.nan
+        for rows, visible in zip(trajectory, first, strict=True):
+            rows[np.arange(frames)[:, None] < self.entry_frame[visible]] = np.nan
         status = self.counter.to_numpy()[:, COUNT.status]
         counters = self._counters()
         for index, (own, collider) in enumerate(zip(counters, self.colliders, strict=True)):
-            for when, frame in (("start", 0), ("end", -1)):
+            places = {"start": (self.scenes[index].position_N3, 0), "end": (last[every[index]], frames - 1)}
+            for when, (place_N3, frame) in places.items():
                 if status[index] == STATUS.running:
-                    present = trajectory[index][frame][~absent[index][frame]]
-                    time = (frames - 1) * self.frame_s if when == "end" else 0.0
-                    own[f"particles_inside_obstacles_at_{when}"] = collider.count_inside(present, time)
+                    entered_N3 = place_N3[self.entry_frame[every[index]] <= frame]
+                    inside = collider.count_inside(entered_N3, frame * self.frame_s)
+                    own[f"particles_inside_obstacles_at_{when}"] = inside
         return [
             Simulated(trajectory[index], counters[index])
             if status[index] == STATUS.running

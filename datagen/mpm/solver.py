@@ -60,6 +60,7 @@ def simulate(
     colliders: Sequence[Collider] | None = None,
     team: Team | None = None,
     stability_fractions: Sequence[float] | None = None,
+    children: int = 1,
 ) -> list[Simulated | SceneFailure]:
     """Simulates `scenes` together, and returns `frames` frames of each, the initial state included.
 
@@ -74,7 +75,8 @@ def simulate(
     called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.
     `cpu_threads` applies to the process's first simulation (see `initialise`). `colliders` are results of
     `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: chosen by
-    device and scenes. `stability_fractions` replace the config's.
+    device and scenes. `stability_fractions` replace the config's. Results contain the first of each
+    `children` particles (see datagen.fine); counters count all particles.
 
     On a CPU a scene's result does not depend on its batch, bitwise. `cpu_threads` changes it only through the number of
     partial sums, min(cpu_threads, 4). On a GPU sums have no fixed order.
@@ -129,7 +131,7 @@ def simulate(
             [fractions[i] for i in group],
         )  # fmt: skip
         own_team = Team(0) if group is single else team or _team(device, [scene.particle_count for scene in batch[0]])
-        outcomes = _launched(device, own_team, batch, frames, report)
+        outcomes = _launched(device, own_team, batch, frames, report, children)
         for index, outcome in zip(group, outcomes, strict=True):
             results[index] = outcome
         before += frames * len(group)
@@ -140,24 +142,24 @@ def simulate(
 
 
 def _launched(
-    device: Device, team: Team, batch: tuple[Any, ...], frames: int, on_frame: Callable[[int], None]
+    device: Device, team: Team, batch: tuple[Any, ...], frames: int, on_frame: Callable[[int], None], children: int
 ) -> list[Simulated | SceneFailure]:
     with _arrays_freed_here():
         if team.threads:
             try:
-                return _run(TeamLaunch(team, _teams_at_once(device, team), *batch), frames, on_frame)
+                return _run(TeamLaunch(team, _teams_at_once(device, team), *batch), frames, on_frame, children)
             except BlocksApartError:
                 warnings.warn(
                     f"the {device.kind} does not run {team.blocks} blocks of {team.threads} threads at once, which "
                     "share a scene: scenes take one launch a substep, which is slower; leave the device to this "
                     "process alone", RuntimeWarning, stacklevel=3,
                 )  # fmt: skip
-        return _run(GridLaunch(device, *batch), frames, on_frame)
+        return _run(GridLaunch(device, *batch), frames, on_frame, children)
 
 
-def _run(launch: Launch, frames: int, on_frame: Callable[[int], None]) -> list[Simulated | SceneFailure]:
+def _run(launch: Launch, frames: int, on_frame: Callable[[int], None], children: int) -> list[Simulated | SceneFailure]:
     try:
-        return launch.run(frames, on_frame)
+        return launch.run(frames, on_frame, children)
     finally:
         launch.release()
 

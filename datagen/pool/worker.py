@@ -12,7 +12,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from datagen.fine import scene_to_simulate, solver_on_grid, visible_positions
+from datagen.fine import scene_to_simulate, solver_on_grid
 from datagen.pool.plan import SceneTask
 from datagen.pool.worker_plan import WorkerPlan
 from hgn.config import DatagenConfig
@@ -184,7 +184,7 @@ def simulate_batch(
     threads: int | None,
     reporter: Callable[[int], Callable[[int], None]] | None = None,
 ) -> list[Any]:
-    """Simulates a batch in one launch per episode length. Returns the solver's results.
+    """Simulates a batch in one launch per episode length. Returns the solver's results for visible particles.
 
     `reporter` maps the number of scenes in a launch to a function that is called with each frame.
     """
@@ -192,6 +192,7 @@ def simulate_batch(
     launches: dict[int, list[MadeScene]] = {}
     for made in batch:
         launches.setdefault(config.dataset.frames_of(made.task.index), []).append(made)
+    children = 1 if config.reference is None else config.reference["particles_per_visible"]
     results: dict[SceneTask, Any] = {}
     for frames, launch in sorted(launches.items()):
         of_launch = simulate(
@@ -202,16 +203,10 @@ def simulate_batch(
             on_frame=reporter and reporter(len(launch)),
             cpu_threads=threads,
             colliders=[made.collider.open() for made in launch],
+            children=children,
         )
-        results |= {m.task: _visible(m.scene.open(), result) for m, result in zip(launch, of_launch, strict=True)}
+        results |= {made.task: result for made, result in zip(launch, of_launch, strict=True)}
     return [results[made.task] for made in batch]
-
-
-def _visible(scene: Scene, result: Any) -> Any:
-    """Returns a result of the solver with only the positions of the visible particles (see datagen.fine)."""
-    if not hasattr(result, "position_TN3"):
-        return result
-    return replace(result, position_TN3=visible_positions(result.position_TN3, scene.particle_count))
 
 
 def failure_of(result: Any) -> str | None:

@@ -64,17 +64,16 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], ea
 def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
     """Returns a launch size that fills a GPU. It is smaller for large grids, and if frames would need too much memory.
 
-    Frames stay in host memory until they are published, and may fill half of it.
+    Frames of visible particles stay in host memory until they are published, and may fill half of it.
     """
     scene = config.scene
     nodes = math.prod(math.ceil(length / config.reference_cell_size) for length in scene.domain_size)
     particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
     if scene.kinds:
         particles = MAXIMUM_PARTICLES
-    particles *= config.reference["particles_per_visible"] if config.reference else 1
     held = memory_bytes / 2 / (12 * config.dataset.most_frames * max(particles, 1))
     gigabytes = f"{memory_bytes / 2e9 / max(held, 1e-9):.3g} GB of {memory_bytes / 2e9:.3g}"
-    rule = "such that the frames of a scene's particles fit in half of a worker's memory"
+    rule = "such that the frames of a scene's visible particles fit in half of a worker's memory"
     require(held >= 1 or not config.reference, "dataset.reference_cells", rule, gigabytes)
     return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
 
