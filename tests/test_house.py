@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 33_751,
-    "datagen": 8_987,
+    "datagen": 8_990,
     "tools": 6_353,
-    "tests": 34_149,
+    "tests": 34_172,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
