@@ -286,6 +286,9 @@ class NetworkConfig:
     width: LayerSize = 128  # number of values in latent vectors and hidden layers
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
     obstacle_features: bool = True  # normals of obstacle cells as inputs; false is only for scenes without obstacles
+    # nearness and direction of surfaces up to two obstacle cells away, in place of the normals of the cells that
+    # surfaces pass through (hgn.scene.surface_field); not with absolute inputs
+    obstacle_distance: bool = False
     # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion; local:
     # relative, and each body has cells of its own (hgn.network.grid)
     inputs: Annotated[str, one_of("absolute", "relative", "local")] = "absolute"
@@ -301,6 +304,9 @@ class NetworkConfig:
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
         rule = "an empty list with inputs=absolute"
         require(self.relative or not self.own_physics, "own_physics", rule, list(self.own_physics))
+        sees = self.relative and self.obstacle_features
+        rule = "false with inputs=absolute or obstacle_features=false"
+        require(sees or not self.obstacle_distance, "obstacle_distance", rule, True)
         whole = "elastic" in self.materials or "elastic" not in self.own_physics
         require(whole, "materials", "with elastic where own_physics has it", list(self.materials))
         if self.relative:

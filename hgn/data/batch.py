@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.data.episode_tensors import frame_gravity, shown_symmetries
+from hgn.data.episode_tensors import frame_gravity, seen_surfaces, shown_symmetries
 from hgn.data.sampler import SamplerState
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState, material_rows
@@ -121,7 +121,7 @@ def moving_in(samples: Sequence[BatchSample], network: NetworkConfig) -> MovingO
     if "moving" not in network.own_physics:
         return None
     scenes, frames = [moving_of_episode(s.episode) for s in samples], [s.frame for s in samples]
-    return MovingObstacles.of(scenes, frames, 1 / samples[0].episode.frame_rate_hz, network.obstacle_features)
+    return MovingObstacles.of(scenes, frames, 1 / samples[0].episode.frame_rate_hz, network)
 
 
 def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
@@ -129,6 +129,7 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
     episodes = [sample.episode for sample in samples]
     particles = tuple(len(episode.material_N) for episode in episodes)
     material_N = torch.cat([material_rows(e.material_N, network.materials, e.materials) for e in episodes])
+    grids = [seen_surfaces(e, network) for e in episodes] if network.obstacle_features else []
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate([sample.window_WN3 for sample in samples], axis=1)),
         material_N=material_N,
@@ -136,7 +137,7 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
         gravity_S3=torch.tensor([frame_gravity(episode) for episode in episodes], dtype=torch.float32),
-        obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
+        obstacles=ObstacleCells.of(grids),
         seeds_S=tuple(sample.seed for sample in samples),
         weight_S=tuple(sample.weight for sample in samples),
         noise_scale_S=tuple(sample.noise_scale for sample in samples),

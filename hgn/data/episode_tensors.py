@@ -15,6 +15,7 @@ from hgn.network.features import material_rows
 from hgn.network.own_physics import physics_fields
 from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
+from hgn.scene.episode_obstacles import field_of_episode
 from hgn.scene.history import frames_before
 from hgn.scene.moving import MovingObstacle, moving_of_episode
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -53,15 +54,16 @@ class EpisodeChunk:
 def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | None = None) -> EpisodeTensors:
     """Returns an episode as tensors. Rows n to n + H + 1 are `hgn.scene.history.window` of frame n."""
     past = frames_before(episode, -network.velocity_history)
-    grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
-    cell_K3, normal_K3 = grid.cell_K3[:seen], grid.normal_K3[:seen]
-    friction_K = None if grid.friction_K is None else grid.friction_K[:seen].astype(np.float32)
+    grid, seen = seen_surfaces(episode, network), int(network.obstacle_features)
+    cell_K3, normal_K3 = (part[: seen * len(part)] for part in (grid.cell_K3, grid.normal_K3))
+    friction_K = None if grid.friction_K is None else grid.friction_K[: len(cell_K3)].astype(np.float32)
+    own = cell_K3.astype(np.int32), normal_K3.astype(np.float32), friction_K, grid.distance_K
     material_N = material_rows(episode.material_N, network.materials, episode.materials)
     physics = physics_fields(network, [episode], material_N)
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
         material_N.int(),
-        ObstacleGrid(grid.cell_size, cell_K3.astype(np.int32), normal_K3.astype(np.float32), friction_K),
+        ObstacleGrid(grid.cell_size, *own),
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),
@@ -72,6 +74,11 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
         moving_of_episode(episode) if "moving" in network.own_physics else (),
         1 / episode.frame_rate_hz,
     )
+
+
+def seen_surfaces(episode: Episode, network: NetworkConfig) -> ObstacleGrid:
+    """Returns the cells of obstacles at rest that a network with obstacle features sees."""
+    return field_of_episode(episode) if network.obstacle_distance else episode.obstacle_grid
 
 
 def frame_gravity(episode: Episode) -> Vector:

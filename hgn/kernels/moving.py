@@ -33,7 +33,8 @@ class EpisodeMoving:
         obstacles: tuple[MovingObstacle, ...], frame_s: float, network: NetworkConfig, device: torch.device
     ) -> "EpisodeMoving":
         """Returns the obstacles as `network` sees them."""
-        hashes = (SceneHash.of_grid(obstacle.grid, "friction" in network.own_physics) for obstacle in obstacles)
+        grids = (obstacle.surfaces(network.obstacle_distance) for obstacle in obstacles)
+        hashes = (SceneHash.of_grid(grid, "friction" in network.own_physics) for grid in grids)
         return EpisodeMoving(obstacles, tuple(own and own.to(device) for own in hashes), frame_s)
 
 

@@ -33,14 +33,17 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 
 @triton.jit
-def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr, ROW: tl.constexpr):
+def obstacle_normals(
+    x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr, ROW: tl.constexpr, REACH: tl.constexpr
+):
     """Returns x, y and z of the obstacle normals at positions of any shape, and friction if ROW is 4; zeros without an
-    obstacle. ROW is the number of values of a cell in the table.
+    obstacle. With REACH above 0 the table has a distance after the ROW values of a cell, and normals are multiplied by
+    the nearness, as in hgn.network.obstacles.
     `line` is the scenes' row of the obstacle table. With SYMMETRY positions and normals are those of an image of the
     scene. The function looks the positions up in the scene itself."""
-    x = tl.floor(tl.div_rn(x, obstacle_cell_size))
-    y = tl.floor(tl.div_rn(y, obstacle_cell_size))
-    z = tl.floor(tl.div_rn(z, obstacle_cell_size))
+    px, py, pz = tl.div_rn(x, obstacle_cell_size), tl.div_rn(y, obstacle_cell_size), tl.div_rn(z, obstacle_cell_size)
+    x, y, z = tl.floor(px), tl.floor(py), tl.floor(pz)
+    px, py, pz = px - x - 0.5, py - y - 0.5, pz - z - 0.5
     if SYMMETRY:
         symmetry = tl.load(line + OBSTACLE_COLUMNS - 1, mask=live, other=0)
         ix, iy, iz = _before_mirror(x, symmetry, 0), _before_mirror(y, symmetry, 1), _before_mirror(z, symmetry, 2)
@@ -48,7 +51,7 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
         y = _from_axis(ix, iy, iz, symmetry, 1)
         z = _from_axis(ix, iy, iz, symmetry, 2)
     entry = find_cell(x, y, z, line, live)
-    at = tl.load(line + 2, mask=entry >= 0, other=0).to(tl.pointer_type(tl.float32)) + entry * ROW
+    at = tl.load(line + 2, mask=entry >= 0, other=0).to(tl.pointer_type(tl.float32)) + entry * (ROW + (REACH > 0))
     found = ()
     for axis in tl.static_range(3):
         if SYMMETRY:
@@ -60,6 +63,14 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
         found = found + (normal,)  # noqa: RUF005 - Triton does not support unpacking here
     for column in tl.static_range(3, ROW):
         found = found + (tl.load(at + column, mask=entry >= 0, other=0.0),)  # noqa: RUF005
+    if REACH > 0:
+        distance = found[0] * px + found[1] * py + found[2] * pz + tl.load(at + ROW, mask=entry >= 0, other=REACH)
+        near = tl.maximum(1 - tl.abs(distance) / REACH, 0.0)
+        side = tl.where(distance < 0, -near, near)
+        seen = found[0] * side, found[1] * side, found[2] * side
+        for column in tl.static_range(3, ROW):
+            seen = seen + (tl.where(near > 0, found[column], 0.0),)  # noqa: RUF005
+        found = seen
     return found
 
 

@@ -27,15 +27,15 @@ class SceneHash:
 
     bucket_B: torch.Tensor  # int32
     key_K: torch.Tensor  # int64
-    # An obstacle cell has its normal, float32 [K, 3], or normal and friction [K, 4]. A barrier cell has the range of
-    # its list of triangles, int32.
+    # An obstacle cell has its normal, then friction and distance where the network has them, float32 [K, 3 to 5]. A
+    # barrier cell has the range of its list of triangles, int32.
     value_K: torch.Tensor
     lists: tuple[torch.Tensor, ...] = ()  # a barrier's lists, int32 [E], and triangles, float32 [F, 24]
     last: int = 0  # last column of the row: bits of a barrier's cell size, or the obstacles' symmetry, set later
 
     @staticmethod
     def of_obstacles(cell_K3: torch.Tensor, value_KV: torch.Tensor) -> SceneHash:
-        """Returns the hash of cells int [K, 3] with normals, or also friction, [K, 3 or 4], on their device."""
+        """Returns the hash of cells int [K, 3] with rows [K, 3 to 5] as of ObstacleCells.rows, on their device."""
         bucket_B, key_K, order_K = in_buckets(cell_K3)
         return SceneHash(bucket_B, key_K, value_KV[order_K].float().contiguous())
 
@@ -45,6 +45,8 @@ class SceneHash:
         values = [grid.normal_K3]
         if friction:
             values.append(np.zeros((len(grid.cell_K3), 1)) if grid.friction_K is None else grid.friction_K[:, None])
+        if grid.distance_K is not None:
+            values.append(grid.distance_K[:, None])
         tensors = torch.from_numpy(grid.cell_K3), torch.from_numpy(np.concatenate(values, axis=1))
         return SceneHash.of_obstacles(*tensors) if len(grid.cell_K3) else None
 
@@ -99,7 +101,7 @@ class SceneTable:
         """Returns the table of a batch's obstacle cells, on their device. With `friction` cells have theirs."""
         scene_K, cell_K3 = unpack(cells.key_K)
         counts = torch.bincount(scene_K, minlength=scenes).tolist()
-        parts = zip(cell_K3.split(counts), cells.values(friction).split(counts), strict=True)
+        parts = zip(cell_K3.split(counts), cells.rows(friction).split(counts), strict=True)
         hashes = [SceneHash.of_obstacles(cell, value) if len(cell) else None for cell, value in parts]
         table = SceneTable(hashes, OBSTACLE_COLUMNS, cells.key_K.device, cells.cell_size)
         table._source = cells

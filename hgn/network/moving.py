@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
+from hgn.config import NetworkConfig
 from hgn.network.barriers import Barriers
 from hgn.network.grid import GridHierarchy
 from hgn.network.obstacles import ObstacleCells, first_surface
@@ -106,17 +107,19 @@ class MovingObstacles:
         scenes: Sequence[tuple[MovingObstacle, ...]],
         frames: Sequence[int],
         frame_s: float,
-        features: bool = True,
+        network: NetworkConfig,
         clearance: float | None = None,
     ) -> MovingObstacles | None:
-        """Returns the moving obstacles of scenes, scene s at frames[s]; None if none moves."""
+        """Returns the moving obstacles of scenes as a network sees them, scene s at frames[s]; None if none moves."""
         if not any(scenes):
             return None
         rows, cells = [row for layer in zip_longest(*scenes) for row in layer], None
         size = next(row.grid.cell_size for row in rows if row is not None)
-        nothing = ObstacleGrid(size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-        if features:
-            cells = ObstacleCells.of([nothing if row is None else row.grid for row in rows])
+        if network.obstacle_features:
+            none_K, distance = np.zeros(0, np.float32), network.obstacle_distance
+            nothing = ObstacleGrid(size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+            nothing = replace(nothing, distance_K=none_K if distance else None)
+            cells = ObstacleCells.of([nothing if row is None else row.surfaces(distance) for row in rows])
         own = tuple(map(tuple, scenes))
         moving = MovingObstacles(own, tuple(frames), frame_s, cells, None, poses_of(own, frames, frame_s))
         return moving if clearance is None else moving.with_barriers(clearance)

@@ -159,9 +159,11 @@ def obstacle_surfaces(
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns contacts of particles [N]: 1 with an obstacle normal, else twice the largest wall nearness, at most 1."""
-    gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
-    return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
+    """Returns contacts of particles [N]: twice the largest nearness of a wall or length of a normal, at most 1."""
+    near_N = wall_N6.amax(-1)
+    if normal_N6 is not None:
+        near_N = torch.maximum(near_N, normal_N6.unflatten(1, (2, 3)).norm(dim=-1).amax(-1))
+    return (2 * near_N).clamp(max=1)
 
 
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, local: bool) -> torch.Tensor:

@@ -28,7 +28,8 @@ from hgn.scene.material import INPUT_PARAMETERS
 from hgn.scene.motion import AT_REST
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import NOMINAL_P, input_parameters
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.scene import Obstacle, Scene, all_corners
+from hgn.scene.surface_field import surface_field
 from hgn.schema import require, require_count
 from hgn.step.reference import Accelerations, advanced
 
@@ -233,11 +234,13 @@ def _obstacles(
     placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in own_poses}
     obstacles, barriers = None, start.barriers
     if config.obstacle_features:
-        rest = _cells(scene, staying, device)
-        placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
+        far = config.obstacle_distance
+        require(not far or inputs.smoothing == 0, "smoothing", "0 with obstacle_distance", inputs.smoothing)
+        rest = _cells(scene, staying, device, far)
+        placed = tuple((_cells(scene, [scene.obstacles[i]], device, far), pose) for i, pose in placements.items())
         friction_K = rest.surface_rows[:, 3] if any(o.friction for o in scene.obstacles) else None
         own = rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing
-        obstacles = PosedObstacleCells(*own, friction_K=friction_K)
+        obstacles = PosedObstacleCells(*own, friction_K=friction_K, distance_K=rest.distance_K)
     clearance = network.step.obstacle_clearance
     if clearance is not None and placements:
         barriers = _barriers(scene, placements, clearance, device, dtype=dtype)
@@ -296,10 +299,10 @@ def _barriers(
     return barriers and replace(barriers.to(device), row_F24=barrier_rows(corner_F33, clearance).to(dtype))
 
 
-def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> ObstacleCells:
+def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device, distance: bool) -> ObstacleCells:
     # not cut at the domain: an obstacle may be moved into it
     grid: ObstacleGrid = build_obstacle_grid(obstacles, scene.cell_size, scene.seed)
-    cells = ObstacleCells.of([grid])
+    cells = ObstacleCells.of([surface_field(grid, all_corners(obstacles)) if distance else grid])
     if cells is None:
         cells = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), scene.cell_size)
     return cells.to(device)

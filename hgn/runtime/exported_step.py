@@ -85,21 +85,22 @@ class Step(nn.Module):
         """Returns positions [N, 3] and velocities [N, H, 3], newest first, one frame later, in domain units and frames.
 
         `material`, int64 [N], indexes the network's materials. `domain_size` and `gravity` are [3]. `obstacle_cell` is
-        int64 [K, 3] without repetition, `obstacle_normal` [K, 3]. `obstacle_triangle` [F, 3, 3] are corners. Networks
-        with absolute inputs ignore gravity; networks without `obstacle_clearance` ignore triangles.
+        int64 [K, 3] without repetition, `obstacle_normal` [K, 3], with `obstacle_distance` [K, 4] with the distance of
+        the cell's centre last. `obstacle_triangle` [F, 3, 3] are corners. Networks with absolute inputs ignore gravity;
+        networks without `obstacle_clearance` ignore triangles.
 
         `own` are those of OWN_INPUTS that the network has: friction of the walls across x, y, z [3], and of obstacle
         cells [K]; values of INPUT_PARAMETERS [N, P]; places at rest [R, 3], and neighbours at rest, int64 [R, B],
         -1 for none; poses x -> R x + t of moving obstacles, R and then t, in this frame and the next [2, V, 3, 4],
-        their cells, int64 [K, 4], the obstacle's number first, normals and friction of these [K, 4], and triangles
-        [V, F, 3, 3].
+        their cells, int64 [K, 4], the obstacle's number first, normals and friction of these [K, 4], with
+        `obstacle_distance` [K, 5], and triangles [V, F, 3, 3].
         """
         given = dict(zip(input_names(self.network.config)[len(INPUTS) :], own, strict=False))
         # Another cell, out of reach of every particle, so that the lists are never empty.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
-        normal_K3 = torch.cat([obstacle_normal, torch.zeros_like(domain_size[None])])
-        key_K = pack(torch.zeros_like(cell_K3[:, 0]), cell_K3)
+        key_K, distance = pack(torch.zeros_like(cell_K3[:, 0]), cell_K3), self.network.config.obstacle_distance
+        obstacles = ObstacleCells.of_rows(key_K, pad(obstacle_normal, (0, 0, 0, 1)), self.obstacle_cell_size, distance)
         friction_K = pad(given["obstacle_friction"], (0, 1)) if "obstacle_friction" in given else None
         state = ParticleState(
             position_N3=position,
@@ -108,7 +109,7 @@ class Step(nn.Module):
             scene_N=torch.zeros_like(material),
             domain_S3=domain_size[None],
             gravity_S3=gravity[None],
-            obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size, friction_K=friction_K),
+            obstacles=replace(obstacles, friction_K=friction_K),
             barriers=self._barriers(obstacle_triangle),
             **self._own_fields(given, material),
         )
@@ -136,7 +137,7 @@ class Step(nn.Module):
         return fields
 
     def _moving(
-        self, pose_2V34: torch.Tensor, cell_K4: torch.Tensor, surface_K4: torch.Tensor, corner_VF33: torch.Tensor
+        self, pose_2V34: torch.Tensor, cell_K4: torch.Tensor, surface_KV: torch.Tensor, corner_VF33: torch.Tensor
     ) -> MovingObstacles:
         """Returns the moving obstacles of the frame. All pivots are 0, so that the places are t."""
         rotation_2V33, place_2V3 = pose_2V34[..., :3], pose_2V34[..., 3]
@@ -145,9 +146,8 @@ class Step(nn.Module):
         poses = Poses(rotation_2V33[0], zero_V3, place_2V3[0], change_V33, shift_V3=shift_V3)
         # Another cell, as for obstacles at rest.
         far_K3, number_K = pad(cell_K4[:, 1:], (0, 0, 0, 1), value=COORDINATE_LIMIT - 1), pad(cell_K4[:, 0], (0, 1))
-        surface_K4 = pad(surface_K4, (0, 0, 0, 1))
-        size, friction_K = self.obstacle_cell_size, surface_K4[:, 3]
-        cells = ObstacleCells(pack(number_K, far_K3), surface_K4[:, :3], size, friction_K=friction_K)
+        key_K, row_KV = pack(number_K, far_K3), pad(surface_KV, (0, 0, 0, 1))
+        cells = ObstacleCells.of_rows(key_K, row_KV, self.obstacle_cell_size, self.network.config.obstacle_distance)
         barriers = self._barriers(corner_VF33.flatten(0, 1))
         if barriers is not None:
             number_VF = torch.ones_like(corner_VF33[:, :, 0, 0], dtype=torch.int64).cumsum(0) - 1
@@ -180,10 +180,11 @@ def initial_arrays(
     solver's defaults.
     """
     require(state.scene_count == 1, "scenes", "one", state.scene_count)
-    cells, normals, friction = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), None
+    own = config.obstacle_distance
+    cells, normals, friction = np.zeros((0, 3), np.int64), np.zeros((0, 3 + own), np.float32), None
     if state.obstacles is not None:
         cells = unpack(state.obstacles.key_K)[1].cpu().numpy()
-        normals, friction = state.obstacles.normal_K3.cpu().numpy(), state.obstacles.friction_K
+        normals, friction = state.obstacles.rows(friction=False).cpu().numpy(), state.obstacles.friction_K
     triangles = np.zeros((0, 3, 3), np.float32) if corner_F33 is None else corner_F33.astype(np.float32)
     if parameter_NP is None:
         parameter_NP = np.tile(np.array(NOMINAL_P, np.float32), (len(state.position_N3), 1))
@@ -216,12 +217,12 @@ def _moving_arrays(moving: MovingObstacles) -> dict[str, np.ndarray]:
     corner_VF33 = np.zeros((len(own), max(map(len, triangles)), 3, 3), np.float32)  # further triangles have no area
     for corners, corner_F33 in zip(corner_VF33, triangles, strict=True):
         corners[: len(corner_F33)] = corner_F33
-    cell_K4, surface_K4 = np.zeros((0, 4), np.int64), np.zeros((0, 4), np.float32)
+    cell_K4, surface_KV = np.zeros((0, 4), np.int64), np.zeros((0, 4), np.float32)
     if moving.cells is not None:
         number_K, cell_K3 = unpack(moving.cells.key_K)
         cell_K4 = torch.cat([number_K[:, None], cell_K3], 1).cpu().numpy()
-        surface_K4 = moving.cells.surface_rows.cpu().numpy()
-    return dict(zip(OWN_INPUTS["moving"], [np.array(poses, np.float32), cell_K4, surface_K4, corner_VF33], strict=True))
+        surface_KV = moving.cells.rows(friction=True).cpu().numpy()
+    return dict(zip(OWN_INPUTS["moving"], [np.array(poses, np.float32), cell_K4, surface_KV, corner_VF33], strict=True))
 
 
 def traced_step(network: ParticleNetwork, info: WeightsInfo, moving: int = 0) -> torch.export.ExportedProgram:
@@ -248,7 +249,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo, moving: int = 0) ->
         "domain_size": (torch.ones(3), None),
         "gravity": (torch.zeros(3), None),
         "obstacle_cell": (torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 1]), cells),
-        "obstacle_normal": (torch.ones(EXAMPLE_CELLS, 3), cells),
+        "obstacle_normal": (torch.ones(EXAMPLE_CELLS, 3 + config.obstacle_distance), cells),
         "obstacle_triangle": (torch.rand(EXAMPLE_TRIANGLES, 3, 3, generator=generator), triangles),
         "wall_friction": (torch.zeros(3), None),
         "obstacle_friction": (torch.zeros(EXAMPLE_CELLS), cells),
@@ -260,7 +261,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo, moving: int = 0) ->
         examples |= {
             "moving_pose": (torch.eye(3, 4).expand(2, moving, 3, 4).clone(), None),
             "moving_cell": (torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 0, 1]), moving_cells),
-            "moving_surface": (torch.ones(EXAMPLE_CELLS, 4), moving_cells),
+            "moving_surface": (torch.ones(EXAMPLE_CELLS, 4 + config.obstacle_distance), moving_cells),
             "moving_triangle": (torch.rand(moving, EXAMPLE_TRIANGLES, 3, 3, generator=generator), moving_triangles),
         }
     example, dynamic = zip(*(examples[name] for name in input_names(config) if name in examples), strict=True)

@@ -34,7 +34,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.emission import at_entry, at_start, entry_frames, require_free_entries
 from hgn.scene.episode import Episode
-from hgn.scene.episode_obstacles import known_obstacles
+from hgn.scene.episode_obstacles import field_around, known_obstacles
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS, elastic_particles
 from hgn.scene.moving import MovingObstacle, at_rest, moving_obstacles, moving_of_episode
@@ -126,6 +126,16 @@ class InitialState:
         """Returns the initial state of a scene, or the given one."""
         require(isinstance(scene, (Scene, InitialState)), "scene", "a Scene or an InitialState", type(scene).__name__)
         return InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
+
+    @functools.cached_property
+    def field(self) -> ObstacleGrid:
+        """Returns hgn.scene.surface_field around the obstacles at rest."""
+        corner_F33 = np.zeros((0, 3, 3)) if self.corners is None else self.corners()
+        return field_around(self.obstacle_grid, corner_F33, self.domain_size, self.dimensions)
+
+    def surfaces(self, distance: bool) -> ObstacleGrid:
+        """Returns the field with `distance` (network.obstacle_distance), else the paper's cells."""
+        return self.field if distance else self.obstacle_grid
 
     @functools.cached_property
     def rest_neighbours(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -231,14 +241,15 @@ class Simulator:
         """Returns the obstacle cells of scenes on the device, or None for a network without obstacle features."""
         if not self.network.config.obstacle_features:
             return None
-        obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes])
+        distance = self.network.config.obstacle_distance
+        obstacles = ObstacleCells.of([scene.surfaces(distance) for scene in scenes])
         return obstacles and obstacles.to(self.device)
 
     def moving(self, scenes: Sequence[InitialState], frames: Sequence[int]) -> MovingObstacles | None:
         """Returns the moving obstacles of scenes on the device, scene s at frames[s] after its start."""
         config, clearance = self.network.config, self.network.step.obstacle_clearance
         own = [scene.moving for scene in scenes]
-        moving = MovingObstacles.of(own, frames, 1 / self.frame_rate_hz, config.obstacle_features, clearance=clearance)
+        moving = MovingObstacles.of(own, frames, 1 / self.frame_rate_hz, config, clearance=clearance)
         return moving and moving.to(self.device)
 
     def step(self, state: ParticleState) -> ParticleState:

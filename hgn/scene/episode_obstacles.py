@@ -5,6 +5,7 @@ Shape legend: K obstacle cells, F triangles.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ from hgn.scene.episode import Episode
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rotation import quaternion_rotation
-from hgn.scene.scene import Obstacle
+from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
+from hgn.scene.surface_field import surface_field
+from hgn.schema import Vector
 
 
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
@@ -54,6 +57,20 @@ def _is_here(record: dict[str, Any]) -> bool:
     if not is_mesh_file(shape):
         return True
     return Path(shape).is_file() and mesh_sha256(shape) == record.get("sha256")
+
+
+@lru_cache(maxsize=256)
+def field_of_episode(episode: Episode) -> ObstacleGrid:
+    """Returns hgn.scene.surface_field of an episode's obstacles at rest. The last ones are cached."""
+    still = [obstacle for obstacle in known_obstacles(episode) or () if obstacle.motion is None]
+    return field_around(episode.obstacle_grid, all_corners(still), episode.domain_size, episode.dimensions)
+
+
+def field_around(grid: ObstacleGrid, corner_F33: np.ndarray, domain_size: Vector, dimensions: int) -> ObstacleGrid:
+    """Returns hgn.scene.surface_field of triangles, or of the squares of `cell_obstacles` if there are none."""
+    if not len(corner_F33):
+        corner_F33 = all_corners(cell_obstacles(grid, domain_size[2] / 2 if dimensions == 2 else None))
+    return surface_field(grid, corner_F33, domain_size)
 
 
 def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:

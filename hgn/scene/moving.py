@@ -6,7 +6,7 @@ Shape legend: F triangles.
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from hgn.scene.episode_obstacles import obstacle_of_record
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle
+from hgn.scene.surface_field import surface_field
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,15 @@ class MovingObstacle:
     grid: ObstacleGrid
     corner_F33: np.ndarray  # float64, domain units
     motion: Motion
+
+    @cached_property
+    def field(self) -> ObstacleGrid:
+        """Returns hgn.scene.surface_field around the obstacle."""
+        return surface_field(self.grid, self.corner_F33)
+
+    def surfaces(self, distance: bool) -> ObstacleGrid:
+        """Returns the field with `distance` (network.obstacle_distance), else the paper's cells."""
+        return self.field if distance else self.grid
 
     def barrier(self, clearance: float) -> Barrier:
         """Returns the barrier of its triangles. Raises: ConfigError for an invalid clearance."""

@@ -29,6 +29,8 @@ class ObstacleGrid:
     cell_K3: np.ndarray  # int32, unique rows, lexicographically sorted
     normal_K3: np.ndarray  # float32, unit length
     friction_K: np.ndarray | None = None  # float32, Coulomb coefficients; None: no obstacle has its own
+    # float32, distance of a cell's centre from the surface along its normal, in cells; None: the paper's cells
+    distance_K: np.ndarray | None = None
 
 
 def build_obstacle_grid(
@@ -56,7 +58,7 @@ def grid_of_samples(
         return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
     floor_S3 = np.floor(point_S3 / cell_size)
-    key_S, low, extent = _lexicographic_keys(floor_S3)
+    key_S, low, extent = lexicographic_keys(floor_S3)
     to_centre_S3 = (floor_S3 + 0.5) * cell_size - point_S3
     away = (normal_S3 * to_centre_S3).sum(axis=1) < 0
     normal_S3 = np.where(away[:, None], -normal_S3, normal_S3)
@@ -104,7 +106,7 @@ def surface_samples(
     return point_S3, normal_S3, corner_F34[owner_S, 0, 3]
 
 
-def _lexicographic_keys(floor_S3: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+def lexicographic_keys(floor_S3: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
     """Returns an integer per cell that sorts like its coordinates, then the lowest cell and the extent."""
     low, high = floor_S3.min(axis=0), floor_S3.max(axis=0)
     extent = [int(length) + 1 for length in high - low]

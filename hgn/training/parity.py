@@ -50,8 +50,8 @@ def require_update_parity(
     if count > CHECKED_PARTICLES:
         return math.nan, math.nan
     state, origin_S3 = _state(updates, episodes, symmetries, count)
-    own, seen = [episode.moving for episode in episodes], updates.config.obstacle_features
-    moving = MovingObstacles.of(own, frames, episodes[0].frame_s, seen)
+    own = [episode.moving for episode in episodes]
+    moving = MovingObstacles.of(own, frames, episodes[0].frame_s, updates.config)
     if moving is not None:
         moving = moving if symmetries is None else moving_under(moving, symmetries)
         state = replace(state, moving=moving.to(updates.device))

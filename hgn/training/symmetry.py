@@ -45,8 +45,9 @@ def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) ->
     key_K = pack(scene_K, torch.where(mirrored_K3, last_S3[scene_K] - cell_K3, cell_K3))
     normal_K3 = _vectors(obstacles.normal_K3, scene_K, symmetries)
     order_K = torch.argsort(key_K)
-    friction_K = None if obstacles.friction_K is None else obstacles.friction_K[order_K]
-    return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size, friction_K=friction_K)
+    own = {name: getattr(obstacles, name) for name in ("friction_K", "distance_K")}
+    values = {name: value_K[order_K] for name, value_K in own.items() if value_K is not None}
+    return replace(obstacles, key_K=key_K[order_K], normal_K3=normal_K3[order_K], **values)
 
 
 def moving_under(moving: MovingObstacles, symmetries: Sequence[Symmetry]) -> MovingObstacles:

@@ -99,8 +99,8 @@ class TritonScenes:
         if "moving" in self._network.config.own_physics:
             bodies = [episode.moving.obstacles for episode in episodes] + [()] * empty
             frames = [episode.first_frame + frame for episode, frame in starts] + [0] * empty
-            clearance, seen = self._network.step.in_training.obstacle_clearance, self._network.config.obstacle_features
-            moving = MovingObstacles.of(bodies, frames, episodes[0].moving.frame_s, seen, clearance=clearance)
+            config, clearance = self._network.config, self._network.step.in_training.obstacle_clearance
+            moving = MovingObstacles.of(bodies, frames, episodes[0].moving.frame_s, config, clearance=clearance)
             own["moving"] = moving and moving.to(device)
         return ParticleState(
             position_N3=past_TN3[-1],
@@ -177,8 +177,7 @@ class TritonScenes:
             key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
             order_K = torch.argsort(key_K)
             value_KV = torch.cat([cells.value_K for _, cells in seen])[order_K]
-            friction_K = value_KV[:, 3] if value_KV.shape[1] > 3 else None
-            normal_K3, size = value_KV[:, :3], self._obstacle_cell_size
-            obstacles = ObstacleCells(key_K[order_K], normal_K3, size, friction_K=friction_K)
+            distance = self._network.config.obstacle_distance
+            obstacles = ObstacleCells.of_rows(key_K[order_K], value_KV, self._obstacle_cell_size, distance)
         first = state.selected(slice(count))
         return replace(first, material_N=first.material_N.long(), obstacles=obstacles)

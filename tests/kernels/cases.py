@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from kernels.engines import engine_of, gradients, run_forward
 from network.barrier_scenes import square
-from network.states import network_of, random_grid, random_state
+from network.states import near_state, network_of, random_grid, random_state
 
+from hgn.config import NetworkConfig
 from hgn.network.elastic import RestShape
 from hgn.network.moving import MovingObstacles
 from hgn.runtime.parity import relative_error
@@ -93,13 +94,15 @@ def swept(seed, friction=0.4, cells=4_000):
     return MovingObstacle(replace(grid, friction_K=rough_K), SQUARE_F33, motion)
 
 
-def swept_state(counts, friction=0.4, still=True):
+def swept_state(counts, friction=0.4, still=True, distance=False):
     """The same with moving obstacles, of which scene s has 2 - s."""
     state = rough_state(counts, friction, friction, 0.02)
+    state = near_state(state) if distance else state
     scenes = [
         tuple(swept(7 + 2 * scene + number, friction) for number in range(2 - scene)) for scene in range(len(counts))
     ]
-    moving = MovingObstacles.of(scenes, [3, 8, 1][: len(counts)], 1 / 60)
+    network = NetworkConfig(inputs="relative", obstacle_distance=distance)
+    moving = MovingObstacles.of(scenes, [3, 8, 1][: len(counts)], 1 / 60, network)
     return replace(state, moving=moving, obstacles=state.obstacles if still else None)
 
 
@@ -151,6 +154,7 @@ RELATIVE = {"inputs": "relative"}
 OWN = {"inputs": "local", "own_physics": ("friction", "parameters")}
 ELASTIC = {"own_physics": ("friction", "parameters", "elastic"), "materials": MATERIALS}
 MOVING = OWN | {"own_physics": ("friction", "parameters", "moving")}
+NEAR = {"obstacle_distance": True}
 SHUFFLED = ("water", "snow", "sand")
 # Relative inputs: in the weights of normals the rounding of distances counts tenfold (FEW).
 CASES = {
@@ -183,6 +187,9 @@ CASES = {
         1e-4,
         MOVING | {"levels": 1},
     ),
+    "distances": Case(lambda: near_state(rough_state(CROWD)), 1e-4, OWN | NEAR),
+    "distances without friction": Case(lambda: near_state(moving_state(CROWD)), 4e-5, RELATIVE | NEAR),
+    "distances of moving obstacles": Case(lambda: swept_state(CROWD, distance=True), 2e-4, MOVING | NEAR),
     "elastic bodies": Case(lambda: elastic_state((40, 17)), 1e-4, OWN | ELASTIC),
 }
 

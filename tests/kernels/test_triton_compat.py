@@ -42,7 +42,7 @@ def test_what_the_interpreter_forgives(lines):
     compiled = [line[1] for line in lines if line[0] == "COMPILED"]
     names = {"sum_motion", "prepare_relative_features", "sum_coarsest", "balance", "balance_backward", "add_coarsest"}
     assert set(compiled) > names and len(compiled) > len(set(compiled)), compiled
-    assert compiled.count("integrate") == 3  # free, between obstacles, and between walls too
+    assert compiled.count("integrate") == 4  # free, between obstacles, and between walls, at rest and in motion, too
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.surface_field import REACH_CELLS
 from hgn.step_config import StepConfig
 
 GRAVITY = (0.0, -9.8 / 3600, 0.0)  # domain units per frame squared
@@ -141,3 +142,10 @@ def _with_random_weights(values, dtype):
     network.normaliser.set("velocity", torch.tensor([1e-4, -2e-3, 0.0]), torch.tensor([1e-3, 2e-3, 3e-3]), 1e-3)
     network.normaliser.set("acceleration", torch.tensor([0.0, -1e-3, 1e-5]), torch.tensor([1e-3, 2e-3, 1e-3]), 1e-3)
     return network.to(dtype)
+
+
+def near_state(state):
+    """A state with distances of obstacle cells, from far behind surfaces to out of reach."""
+    cells, generator = state.obstacles, torch.Generator().manual_seed(6)
+    distance_K = 3 * REACH_CELLS * (torch.rand(len(cells.key_K), generator=generator) - 0.4)
+    return replace(state, obstacles=replace(cells, distance_K=distance_K))

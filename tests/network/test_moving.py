@@ -10,7 +10,7 @@ from network.states import airborne, network_of
 from scene.test_episode import members_of
 from training.test_symmetry import ALL_48
 
-from hgn.config import SceneConfig
+from hgn.config import NetworkConfig, SceneConfig
 from hgn.data.batch import make_batch
 from hgn.network.barriers import Barriers
 from hgn.network.moving import MovingObstacles
@@ -50,7 +50,9 @@ def plates(velocities, turns=None, friction=0.4):
 
 
 def moving_of(obstacles, frame=0):
-    return MovingObstacles.of([moving_obstacles(obstacles, CELL)], [frame], FRAME_S, clearance=CLEARANCE)
+    return MovingObstacles.of(
+        [moving_obstacles(obstacles, CELL)], [frame], FRAME_S, NetworkConfig(), clearance=CLEARANCE
+    )
 
 
 def struck(velocity=(0.0, 0.0, 0.0), count=60):

@@ -53,6 +53,7 @@ def network(kind, dtype=torch.float64):
         return gns_of(dtype, message_passing_steps=2, obstacle_features=False)
     changes = {
         "relative": {"inputs": "relative", "rest_threshold": 1.0},
+        "distance": {"inputs": "relative", "obstacle_distance": True},
         # The cone holds some particles; some begin beyond the walls, some come to them.
         "held": {"wall_clearance": (0.43, 0.1), "obstacle_clearance": CLEARANCE},
     }
@@ -78,14 +79,14 @@ def positions(simulator, inputs, smoothing, frames):
 
 @pytest.mark.parametrize(
     ("kind", "smoothing", "frames"),
-    [("absolute", 0.5, 6), ("relative", 1.0, 6), ("gns", 0.0, 6), ("held", 0.0, HELD_FRAMES)],
+    [("absolute", 0.5, 6), ("relative", 1.0, 6), ("gns", 0.0, 6), ("held", 0.0, HELD_FRAMES), ("distance", 0.0, 6)],
 )
 def test_gradients_are_those_of_central_differences(kind, smoothing, frames):
     """Over up to 30 frames, along a random direction of each input, along which its own slope is one, in all of them
     together; no particle changes a cell in between."""
     simulator = Simulator(network(kind), 60.0, "torch")
     inputs = {name: value.clone().requires_grad_() for name, value in INPUTS.items()}
-    if kind != "relative":
+    if kind not in ("relative", "distance"):
         del inputs["gravity_3"]
     generator = torch.Generator().manual_seed(1)
     weight_TN3 = torch.randn(frames, PARTICLES, 3, generator=generator, dtype=torch.float64)
@@ -93,7 +94,7 @@ def test_gradients_are_those_of_central_differences(kind, smoothing, frames):
     directions, nonzero = {}, 0
     for name, value in inputs.items():
         direction = torch.randn(value.shape, generator=generator, dtype=torch.float64)
-        # without smoothing a translation has no gradient
+        # without smoothing or distances a translation has no gradient
         slope = 0.0 if value.grad is None else (value.grad * direction).sum().item()
         directions[name], nonzero = direction / (slope or 1.0), nonzero + bool(slope)
     with torch.no_grad():
@@ -104,11 +105,12 @@ def test_gradients_are_those_of_central_differences(kind, smoothing, frames):
     cell_size = simulator.network.config.cell_size
     crossed = (high_TN3 / cell_size - 0.5).floor() != (low_TN3 / cell_size - 0.5).floor()
     assert not bool(crossed.any())
+    assert kind != "distance" or inputs["translation_3"].grad.abs().max() > 0
     difference = ((high_TN3 - low_TN3) * weight_TN3).sum() / (2 * STEP)
     assert difference.item() == pytest.approx(nonzero, rel=0, abs=1e-4 / len(inputs))
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative", "gns", "held"])
+@pytest.mark.parametrize("kind", ["absolute", "relative", "gns", "held", "distance"])
 def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")
@@ -223,6 +225,11 @@ def test_what_is_refused(options, message):
     """By name, with the rule."""
     with pytest.raises(ConfigError, match=message):
         Simulator(network("absolute"), 60.0, "torch").differentiable(scene(), **({"frames": 2} | options))
+
+
+def test_distances_take_no_smoothing():
+    with pytest.raises(ConfigError, match=r"smoothing must be 0 with obstacle_distance, got 0\.5"):
+        Simulator(network("distance"), 60.0, "torch").differentiable(scene(), 2, smoothing=0.5)
 
 
 def test_divergence_names_the_frame():

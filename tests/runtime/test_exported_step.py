@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from network.states import gns_of, network_of, random_state
+from network.states import gns_of, near_state, network_of, random_state
 from network.test_barriers import scattered
 
 from hgn import export
@@ -41,6 +41,7 @@ FRAMES = 4
 # At its walls random states begin, or end, for some particles, and their ways meet the triangles below.
 WALLED = {"wall_clearance": (0.1, 0.7)}
 OWN = WALLED | {"inputs": "local", "own_physics": OWN_PHYSICS, "materials": MATERIALS, "levels": 2}
+OWN = OWN | {"obstacle_distance": True}
 WHOLE = WALLED | {"inputs": "relative", "rest_threshold": 0.3, "obstacle_clearance": 1e-3, "levels": 1}
 SIZES = [(particles, obstacles) for particles in (1, 216, 3_000) for obstacles in (True, False)]
 CELL = 1 / 64
@@ -360,6 +361,7 @@ def compare(network, step):
     for particles, obstacles in SIZES:
         state = random_state((particles,), dtype=torch.float32, obstacles=obstacles)
         state = replace(state, velocity_NM3=10 * state.velocity_NM3)
+        state = near_state(state) if obstacles and network.config.obstacle_distance else state
         if obstacles and clearance is not None:
             state = replace(state, barriers=Barriers.of([barrier_of_pieces(corner_F33, CELL, clearance)]))
         state, parameter_NP = drawn_physics(state, network.config)

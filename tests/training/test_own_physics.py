@@ -45,9 +45,10 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     store = EpisodeStore(make_dataset(config), "train")
     episodes = [store[i] for i in range(12)]
     rough = [any(episode.wall_friction) for episode in episodes]
+    solid = [friction and len(e.obstacle_grid.cell_K3) > 0 for e, friction in zip(episodes, rough, strict=True)]
     assert 1 < sum(rough) < 10 and 1 < sum(episode.parameters is not None for episode in episodes) < 10
     drawn = {scene.seed: scene for scene in scenes}
-    inputs = NetworkConfig(inputs="local", own_physics=OWN)
+    inputs = NetworkConfig(inputs="local", own_physics=OWN, obstacle_distance=True)
     assert sum(make_batch([(episode, 3)], inputs).moving is not None for episode in episodes) > 0
     for episode in episodes:
         scene, members = drawn[episode.seed], members_of(episode)
@@ -74,7 +75,7 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
 
     def trained(name, *stops):
         mapping = train_mapping(config, tmp_path / name, **MORE)
-        mapping["network"] |= {"inputs": "local", "own_physics": list(OWN)}
+        mapping["network"] |= {"inputs": "local", "own_physics": list(OWN), "obstacle_distance": True}
         for stop in (*stops, 8):
             place.clear()
             place["stop"] = stop
@@ -89,10 +90,11 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     export(last, file)
     network, info = load_weights(file)
     assert info.network.own_physics == OWN and info.own_ranges == own_ranges(OWN)
-    simulator, first = Simulator(network, 60.0, "torch"), episodes[rough.index(True)]
+    simulator, first = Simulator(network, 60.0, "torch"), episodes[solid.index(True)]
     state = make_batch([(first, 0)], network.config).state()
     started = simulator.start([drawn[first.seed]])
     assert torch.equal(state.wall_friction_S3, started.wall_friction_S3)
+    assert torch.equal(state.obstacles.rows(friction=True), started.obstacles.rows(friction=True))
     assert torch.equal(network(state), network_of_checkpoint(read_checkpoint(last), last)(state))
 
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, sand_friction_angle_deg: 60"

@@ -101,7 +101,7 @@ def prepare_features(
         y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
         z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
         line = obstacle_table + scene * OBSTACLE_COLUMNS
-        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY, 3)
+        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY, 3, 0.0)
         for i in tl.static_range(3):
             value = with_column(value, 3 * HISTORY + i, normal[i])
     is_wall = (column >= WALLS) & (column < WALLS + 6)

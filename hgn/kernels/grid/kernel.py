@@ -179,7 +179,7 @@ def prepare_particles(
     obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, turn,
     surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
-    NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
+    NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, REACH: tl.constexpr, FEATURES: tl.constexpr,
     FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, BODIES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -192,7 +192,7 @@ def prepare_particles(
     (`moments` [C, COLUMNS]). It raises column 1 of the coarsest cells' `disturbed` [C, 2] to at least the contact times
     FULLY. With FRICTION, a number of columns, `add_friction` writes these from FRICTION_AT on and adds to `friction`
     [C, COLUMNS]. With MOVING it writes V (`surfaces_of`) to `surface_of` [N, 3], and `add_drift` adds V to `drift`
-    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features.
+    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features, REACH as in obstacle_normals.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -207,7 +207,7 @@ def prepare_particles(
     if MOTION:
         surfaces, touch, surface = surfaces_of(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses,
-            turn, scenes, HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3, MOVING,
+            turn, scenes, HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3, REACH, MOVING,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]

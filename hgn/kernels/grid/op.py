@@ -26,6 +26,7 @@ from hgn.network.features import WALL_DISTANCE_CELLS
 from hgn.network.own_physics import physics_widths
 from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
 from hgn.scene.material import INPUT_PARAMETERS
+from hgn.scene.surface_field import REACH_CELLS
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
@@ -305,7 +306,7 @@ class DeviceGrid:
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
             gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            **self._owners, BODIES=self.config.body_cells,
+            **self._owners, BODIES=self.config.body_cells, REACH=REACH_CELLS if config.obstacle_distance else 0.0,
             MOTION=config.relative, COLUMNS=SUMS, **own_physics, **drift, **arguments_of(moving, particles.count),
             OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip

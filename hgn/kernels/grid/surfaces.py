@@ -23,7 +23,7 @@ FREE, FULL = tl.constexpr(FREE_NEARNESS), tl.constexpr(FULL_NEARNESS)
 @triton.jit
 def _with_moving(
     normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time, asked, obstacle_cell_size,
-    HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr, LAYERS: tl.constexpr,
+    HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr, REACH: tl.constexpr, LAYERS: tl.constexpr,
 ):  # fmt: skip
     """Returns the normal, friction, and V (hgn.network.moving) at fractions `time` of paths [N, 8]. `normal` has those
     of obstacles at rest. LAYERS moving obstacles are added (MovingObstacles.met)."""
@@ -43,7 +43,7 @@ def _with_moving(
         y = own[1][:, None] + way[1][:, None] * time
         z = own[2][:, None] + way[2][:, None] * time
         line = moving + (number * RECORD)[:, None] + 0 * time.to(tl.int32)
-        seen = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW)
+        seen = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW, REACH)
         there = ((seen[0] != 0) | (seen[1] != 0) | (seen[2] != 0)).to(tl.float32)
         own = turned(pose[:, None] + 0 * time.to(tl.int32), seen, asked, False)
         count += there
@@ -63,7 +63,7 @@ def _with_moving(
 def surfaces_of(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses, turn,
     scenes, HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr,
-    MOVING: tl.constexpr,
+    REACH: tl.constexpr, MOVING: tl.constexpr,
 ):  # fmt: skip
     """Returns three results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal
     ahead, friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0
@@ -76,7 +76,8 @@ def surfaces_of(
     size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=walls, other=0.0)
     distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
     value = tl.where(walls, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
-    touch = tl.minimum(2 * tl.max(value, 1), 1.0)
+    near = tl.max(value, 1)
+    touch = tl.minimum(2 * near, 1.0)
     surface = touch, touch, touch
     if OBSTACLES or MOVING > 0:
         # The probes are the present position, and steps along the path to the next frame.
@@ -90,14 +91,14 @@ def surfaces_of(
             y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
             z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
             line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
-            normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW)
+            normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW, REACH)
         else:
             none = 0.0 * time + 0.0 * touch[:, None]
             normal = none, none, none, none
         if MOVING > 0:
             normal = _with_moving(
                 normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time + 0.0 * touch[:, None],
-                asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, MOVING,
+                asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, REACH, MOVING,
             )  # fmt: skip
         found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
         ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
@@ -105,7 +106,10 @@ def surfaces_of(
             value = with_column(value, 6 + i if i < 3 else 12, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
             there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
             value = with_column(value, 9 + i if i < 3 else 13, there)
-        touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
+        for first in tl.static_range(6, 12, 3):
+            length = tl.sum(tl.where((column >= first)[None, :] & (column < first + 3)[None, :], value * value, 0.0), 1)
+            near = tl.maximum(near, tl.sqrt_rn(length))
+        touch = tl.minimum(2 * near, 1.0)
         if MOVING > 0:
             here = tl.max((found & (quarters == 0)).to(tl.int32), 1) > 0
             met = found & (quarters == tl.where(here, 0, ahead)[:, None])
