@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_959,
+    "hgn": 33_968,
     "datagen": 8_990,
     "tools": 6_353,
-    "tests": 34_318,
+    "tests": 34_339,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

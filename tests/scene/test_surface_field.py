@@ -98,6 +98,27 @@ def test_no_obstacle():
     assert len(field.cell_K3) == len(field.normal_K3) == len(field.distance_K) == 0
 
 
+def test_triangles_without_area_are_not_seen():
+    """As in the paper's cells, a triangle that is a point or a line is no surface."""
+    plate = shape_obstacle("square", 0.2, (0.5, 0.3, 0.5))
+    corner_F33 = np.array([[[0.2, 0.8, 0.2]] * 3, [[0.1, 0.9, 0.5], [0.8, 0.9, 0.5], [0.3, 0.9, 0.5]]])
+    grid = build_obstacle_grid([plate], CELL, 0)
+    field, both = (surface_field(grid, np.concatenate([plate.corners, more])) for more in (corner_F33[:0], corner_F33))
+    np.testing.assert_array_equal(both.cell_K3, field.cell_K3)
+    assert len(surface_field(grid, corner_F33).cell_K3) == 0
+
+
+def test_a_long_way_between_surfaces_takes_no_memory():
+    """Two plates a hundred units apart, which a moving obstacle may have, have the cells of each of them."""
+    near, far = (shape_obstacle("square", 0.1, (x, x, x)) for x in (0.5, 100.5))
+    both = [near, far]
+    first, second, field = (
+        surface_field(build_obstacle_grid(own, CELL, 0), all_corners(own)) for own in ([near], [far], both)
+    )
+    np.testing.assert_array_equal(field.cell_K3, np.concatenate([first.cell_K3, second.cell_K3]))
+    np.testing.assert_array_equal(first.cell_K3 + 6400, second.cell_K3)
+
+
 def test_outside_the_domain_nothing_is_kept():
     """A plate ten units long has cells in the domain only, and a margin; they are those of the whole plate's field."""
     plate = shape_obstacle("square", 10.0, (0.5, 0.3, 0.5))
