@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_982,
+    "hgn": 33_991,
     "datagen": 8_990,
     "tools": 6_353,
-    "tests": 34_376,
+    "tests": 34_385,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
