@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_991,
     "datagen": 8_990,
     "tools": 6_353,
-    "tests": 34_385,
+    "tests": 34_386,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

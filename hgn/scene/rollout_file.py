@@ -76,7 +76,7 @@ class Rollout:
     entry_frame_N: np.ndarray | None = None
     materials: tuple[str, ...] = MATERIALS
     # number of dimensions of the motion; with 2 all particles lie in the plane at half of the domain's size in z
-    dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
+    dimensions: Annotated[int, Bound("2 or 3", lambda count: isinstance(count, int) and count in (2, 3))] = 3
 
     def __post_init__(self) -> None:
         require_bounds(self)

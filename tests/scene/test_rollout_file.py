@@ -276,6 +276,7 @@ def external_points(file):
         (attribute("gravity", np.array([0, np.inf, 0])), r"gravity\[1\] must be finite, got inf"),
         (attribute("gravity", np.full(3, 1e300)), "gravity must be at most 1e15"),
         (attribute("dimensions", 2.5), "dimensions must be 2 or 3, got 2.5"),
+        (attribute("dimensions", 2.0), "dimensions must be 2 or 3, got 2.0"),
         (attribute("cell_size", 0.0), "cell_size must be from 1e-9 to 1e9"),
         (array("hgn/source", "3"), "source must be a mapping, got 3"),
         (array("hgn", h5py.SoftLink("/hgn")), "must contain its data itself"),
