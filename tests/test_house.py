@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 33_991,
-    "datagen": 8_990,
+    "datagen": 8_991,
     "tools": 6_353,
-    "tests": 34_386,
+    "tests": 34_391,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -32,7 +32,8 @@ class HealthPage:
 
     def tell(self, status: int, content: dict[str, Any]) -> None:
         """Sets the answer without waiting. A process that ended or was stopped is replaced."""
-        content = {name: str(text)[:1000] for name, text in content.items()}
+        # JSON has up to 12 bytes for a character, and the kernel would write a part of a line longer than the pipe
+        content = {name: str(text)[:300] for name, text in content.items()}
         try:
             os.write(self._reports, json.dumps([status, content]).encode() + b"\n")
         except (BlockingIOError, BrokenPipeError):

@@ -205,7 +205,7 @@ class Index(Sequence[ShardEntry]):
 
     def size(self, name: str) -> int | None:
         """Returns the valid size of a file, or None if it is not part of the index."""
-        match = re.fullmatch(r".*-(\d{6,}|segments|quarantined)\.jsonl", name)
+        match = re.fullmatch(r".*-(\d{6,9}|segments|quarantined)\.jsonl", name)
         kind: int | str = "" if match is None else int(match[1]) if match[1].isdecimal() else match[1]
         return self._bytes(kind) or None if name == self.state.path(kind) else None
 

@@ -40,6 +40,10 @@ def test_the_last_report_is_answered(page):
     assert ask(port) == (503, {"status": "the service has not begun"})
     told.tell(200, {"status": "ok"})
     wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+    told.tell(503, {"status": 2000 * "\U0001f30a"})
+    wait_until(lambda: ask(port)[0] == 503)
+    told.tell(200, {"status": "ok"})
+    wait_until(lambda: ask(port) == (200, {"status": "ok"}))
     with ExitStack() as stack:
         for _ in range(100):
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))

@@ -94,6 +94,7 @@ def test_index(ask, folder):
     path.write_bytes(content + b"not yet published")
     assert ask("/index/1-000000.jsonl")[::2] == (200, content)
     assert ask("/index/1-000000.jsonl", range="bytes=100-")[::2] == (206, content[100:])
+    assert ask(f"/index/1-{5000 * '1'}.jsonl")[0] == 404
 
 
 def test_many_ask_at_once(folder, monkeypatch):
