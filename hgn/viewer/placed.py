@@ -6,9 +6,9 @@ Shape legend: V vertices, S surface samples.
 import dataclasses
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from hgn.runtime.simulator import InitialState
 from hgn.scene.mesh import load_mesh
 from hgn.scene.motion import Motion
 from hgn.scene.moving import MovingObstacle
-from hgn.scene.obstacle_grid import grid_of_samples, surface_samples
+from hgn.scene.obstacle_grid import ObstacleGrid, grid_of_samples, surface_samples
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.scene_file import ObstacleEntry
@@ -130,16 +130,20 @@ def with_obstacles(
 
     Omits cells at rest that are more than one cell outside the domain.
     """
-    cell_size = scene.obstacle_grid.cell_size
+    grid, corners = _at_rest(tuple(obstacles), scene.obstacle_grid.cell_size, scene.domain_size)
+    return dataclasses.replace(scene, obstacle_grid=grid, corners=corners, moving=tuple(moving))
+
+
+@lru_cache(maxsize=1)
+def _at_rest(
+    obstacles: tuple[PlacedObstacle, ...], cell_size: float, domain_size: Vector
+) -> tuple[ObstacleGrid, Callable[[], np.ndarray]]:
+    """Returns the cells and corners of obstacles. While others are dragged they stay the same objects."""
     empty = (np.zeros((0, 3)), np.zeros((0, 3)))
     parts = [empty, *(obstacle.samples for obstacle in obstacles)]
     frictions = [0.0, *(obstacle.body.mesh.friction or 0.0 for obstacle in obstacles)]
     friction_S = np.repeat(frictions, [len(points) for points, _ in parts])
     point_S3, normal_S3 = (np.concatenate(part) for part in zip(*parts, strict=True))
-    near = ((point_S3 >= -cell_size) & (point_S3 < np.array(scene.domain_size) + cell_size)).all(axis=1)
-    return dataclasses.replace(
-        scene,
-        obstacle_grid=grid_of_samples(point_S3[near], normal_S3[near], cell_size, friction_S[near]),
-        corners=lambda: all_corners([obstacle.mesh() for obstacle in obstacles]),
-        moving=tuple(moving),
-    )
+    near = ((point_S3 >= -cell_size) & (point_S3 < np.array(domain_size) + cell_size)).all(axis=1)
+    grid = grid_of_samples(point_S3[near], normal_S3[near], cell_size, friction_S[near])
+    return grid, lambda: all_corners([obstacle.mesh() for obstacle in obstacles])

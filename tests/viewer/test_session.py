@@ -123,6 +123,21 @@ def test_a_dragged_obstacle_carries_particles_along(session):
     assert session.live.state.moving is None
 
 
+def test_obstacles_at_rest_are_not_prepared_again(session):
+    """While one obstacle is dragged, cells and barriers of the others are the same objects; a drop prepares all."""
+    session.use_weights(free_flight(obstacle_clearance=1e-3, own_physics=("moving",), obstacle_distance=True))
+    plate = session.add_obstacle(ObstacleEntry(shape="square", size=0.3, position=(0.5, 0.7, 0.5)), Path())
+    seen = []
+    for height in (0.705, 0.71, 0.715):
+        session.step()
+        session.move_obstacle(replace(plate, position=(0.5, height, 0.5)))
+        assert session.live.state.moving is not None
+        seen.append((session.live.state.obstacles, session.live.state.barriers))
+    assert seen[0][0] is not None and all(cells is seen[0][0] and held is seen[0][1] for cells, held in seen)
+    session.move_obstacle(replace(plate, position=(0.5, 0.9, 0.5)))
+    assert len(session.live.state.obstacles.key_K) > len(seen[0][0].key_K)
+
+
 def test_nothing_enters_where_there_is_no_place(session):
     """Not among particles, not in closed obstacles, not beyond the limit, not in the walls."""
     assert session.drop("water", (0.5, 0.5, 0.5), 0.06) == 0
