@@ -286,9 +286,7 @@ class NetworkConfig:
     width: LayerSize = 128  # number of values in latent vectors and hidden layers
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
     obstacle_features: bool = True  # normals of obstacle cells as inputs; false is only for scenes without obstacles
-    # nearness and direction of surfaces up to two obstacle cells away, in place of the normals of the cells that
-    # surfaces pass through (hgn.scene.surface_field); not with absolute inputs
-    obstacle_distance: bool = False
+    obstacle_distance: bool = False  # distances up to two cells away in place of these (hgn.scene.surface_field)
     # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion; local:
     # relative, and each body has cells of its own (hgn.network.grid)
     inputs: Annotated[str, one_of("absolute", "relative", "local")] = "absolute"
@@ -298,9 +296,12 @@ class NetworkConfig:
     # additional inputs (hgn.network.own_physics): friction of surfaces, parameters of the materials, the deformation of
     # elastic bodies, and the motion of obstacles
     own_physics: OwnPhysics = ()
+    coulomb_friction: bool = False  # friction begins with the law of sliding (hgn.network.own_physics)
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        has = "friction" in self.own_physics or not self.coulomb_friction
+        require(has, "coulomb_friction", "false without friction in own_physics", True)
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
         rule = "an empty list with inputs=absolute"
         require(self.relative or not self.own_physics, "own_physics", rule, list(self.own_physics))

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_995,
+    "hgn": 34_045,
     "datagen": 8_991,
     "tools": 6_353,
-    "tests": 34_406,
+    "tests": 34_362,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

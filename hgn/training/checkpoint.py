@@ -178,13 +178,16 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
             raise ConfigError(f"{name} must be {theirs!r}{why}, got {ours!r}; {remedy}")
 
 
+# settings in which a network of relative inputs may differ from training.init_weights
+FREE = ("network.inputs", "network.obstacle_distance", "network.coulomb_friction")
+
+
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
-    Constraints may differ from those of the weights, and so may relative and local inputs and obstacle_distance,
-    because they do not change tensors. If the weights lack inputs of own physics, the parameters of these inputs begin
-    at 0: outputs without friction stay the same. If they lack the material `elastic`, its embedding begins as the mean
-    of the others.
+    Constraints may differ from those of the weights, and so may settings of FREE, which do not change tensors. If the
+    weights lack inputs of own physics, the parameters of these inputs begin at 0: outputs without friction stay the
+    same. If they lack the material `elastic`, its embedding begins as the mean of the others.
     Raises: ConfigError for a file without weights, another network or data.
     """
     assert config.training.init_weights is not None
@@ -200,7 +203,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     theirs = replace(theirs, **same)
     pairs = _pairs("network", theirs, ours)
     if info.network.relative and config.network.relative:
-        pairs = [pair for pair in pairs if pair[0] not in ("network.inputs", "network.obstacle_distance")]
+        pairs = [pair for pair in pairs if pair[0] not in FREE]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
