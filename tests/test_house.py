@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_045,
+    "hgn": 34_053,
     "datagen": 8_991,
     "tools": 6_353,
-    "tests": 34_362,
+    "tests": 34_377,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -45,13 +45,21 @@ class PosedObstacleCells(ObstacleCells):
     smoothing: float = 0.0  # side of the cube for mean normals, in cells, 0 to 1
 
     def surfaces(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """Returns n_o of each particle, the sum over obstacles shortened to length 1, and friction likewise, [N, 4]."""
-        surface_N4 = smoothed_surfaces(self, position_N3, scene_N, self.smoothing)
+        """Returns n_o of each particle, the sum over obstacles shortened to length 1, and friction likewise, [N, 4].
+
+        With distances normals may be short, and friction is the mean over obstacles within reach.
+        """
+        rows = [smoothed_surfaces(self, position_N3, scene_N, self.smoothing)]
         for cells, placement in self.placed:
             own_N4 = smoothed_surfaces(cells, placement.undo(position_N3), scene_N, self.smoothing)
-            surface_N4 = surface_N4 + torch.cat([own_N4[:, :3] @ placement.rotation_33.T, own_N4[:, 3:]], dim=-1)
+            rows.append(torch.cat([own_N4[:, :3] @ placement.rotation_33.T, own_N4[:, 3:]], dim=-1))
+        surface_N4 = torch.stack(rows).sum(0)
         square_N1 = surface_N4[:, :3].square().sum(-1, keepdim=True)
-        return torch.where(square_N1 > 1, surface_N4 * square_N1.clamp(min=1).rsqrt(), surface_N4)
+        shortened_N4 = torch.where(square_N1 > 1, surface_N4 * square_N1.clamp(min=1).rsqrt(), surface_N4)
+        if all(cells.distance_K is None for cells in (self, *(cells for cells, _ in self.placed))):
+            return shortened_N4
+        count_N1 = torch.stack(rows)[..., :3].any(-1, keepdim=True).sum(0).clamp(min=1)
+        return torch.cat([shortened_N4[:, :3], surface_N4[:, 3:] / count_N1], dim=-1)
 
 
 def smoothed_surfaces(

@@ -1,5 +1,6 @@
 """Gradients through a simulation: against central differences in float64, and what is refused."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +10,7 @@ from network.states import gns_of, network_of, silent
 
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
-from hgn.runtime.differentiable import Pose
+from hgn.runtime.differentiable import Inputs, Pose, _obstacles
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import Simulator
 from hgn.scene.obstacle_grid import build_obstacle_grid
@@ -225,6 +226,20 @@ def test_what_is_refused(options, message):
     """By name, with the rule."""
     with pytest.raises(ConfigError, match=message):
         Simulator(network("absolute"), 60.0, "torch").differentiable(scene(), **({"frames": 2} | options))
+
+
+def test_friction_between_posed_obstacles_is_their_mean():
+    """With distances a particle is within reach of two plates whose normals are short: friction is no sum."""
+    plates = tuple(
+        replace(shape_obstacle("square", 0.3, (0.5, y, 0.5)), friction=friction)
+        for y, friction in ((0.48, 0.4), (0.51, 0.8))
+    )
+    network = network_of(torch.float64, inputs="relative", own_physics=("friction",), obstacle_distance=True)
+    start = Simulator(network, 60.0, "torch").start([replace(scene(), obstacles=plates)])
+    posed = _obstacles(network, start, replace(scene(), obstacles=plates), Inputs(poses={0: Pose(), 1: Pose()}))[0]
+    place_N3 = torch.tensor([[0.5, 0.493, 0.5], [0.5, 0.47, 0.5], [0.5, 0.3, 0.5]], dtype=torch.float64)
+    friction_N = posed.surfaces(place_N3, torch.zeros(3, dtype=torch.int64))[:, 3]
+    torch.testing.assert_close(friction_N, torch.tensor([0.6, 0.4, 0.0]).double(), rtol=1e-6, atol=0)
 
 
 def test_distances_take_no_smoothing():
