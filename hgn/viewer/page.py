@@ -101,9 +101,11 @@ class PlayPage:
         with self._queueing:
             latest, self.actions = self.actions, {}
         for action, client in latest.values():
+            before = self.session.undoable
             try:
                 action()
             except (ConfigError, DivergedError, OSError) as error:
+                self.session.undoable = before  # what was refused is no step of Undo
                 self._notify(str(error), client)
             # A file or a value of one viewer must not end the session of all viewers.
             except Exception as error:  # noqa: BLE001
@@ -220,6 +222,10 @@ class PlayPage:
             frames = max(1, round(seconds * self.rate))
             session.rewind(max(session.recording.earliest, session.frame - frames))
 
+        def set_gravity(gravity: tuple[float, float, float]) -> None:
+            session.remember()
+            session.set_gravity(gravity)
+
         self.play_button.on_click(lambda event: self.do(lambda: self.play(not self.playing), event.client))
         step.on_click(lambda event: self.do(one_step, event.client))
         restart.on_click(lambda event: self.do(self.restart, event.client))
@@ -238,8 +244,7 @@ class PlayPage:
         def _(event: Any) -> None:
             if event.client is not None:
                 x, y, z = (float(value) for value in event.target.value)
-                self.do(session.remember, event.client, "before gravity")
-                self.do(lambda: session.set_gravity((x, y, z)), event.client, "gravity")
+                self.do(lambda: set_gravity((x, y, z)), event.client, "gravity")
 
         @self.weights.on_update
         def _(event: Any) -> None:
@@ -362,7 +367,7 @@ class PlayPage:
             return
         self.session.remember()
         if not self.session.drop(spout.material, spout.position, spout.diameter, spout.speed):
-            self._notify("there is no room for a ball here")
+            raise ConfigError("there is no room for a ball here")
 
     def _limit(self) -> str:
         most = self.session.maximum_particles

@@ -94,7 +94,7 @@ class PlaySession:
 
     def _record_first(self) -> None:
         state = self.live.state
-        self._before: list[tuple[int, tuple[PlacedObstacle, ...], Vector]] = []  # frame, obstacles, gravity: for undo
+        self.undoable: list[tuple[int, tuple[PlacedObstacle, ...], Vector]] = []  # frame, obstacles, gravity: for undo
         recording = Recording(self.keep_bytes)
         recording.enter(self._begin.material_N, state.velocity_NM3.cpu().numpy())
         recording.append(self._frame_at(state.position_N3.cpu().numpy()))
@@ -161,16 +161,16 @@ class PlaySession:
         if then.gravity != self.gravity:
             self.live.set_gravity(then.gravity)
         self.recording.back_to(frame)
+        self.undoable = [before for before in self.undoable if before[0] <= self.frame]
 
     def remember(self) -> None:
         """Stores frame, obstacles and gravity before a change, for `undo`."""
-        self._before = [*self._before[1 - CHANGES :], (self.frame, self.obstacles, self.gravity)]
+        self.undoable = [*self.undoable[1 - CHANGES :], (self.frame, self.obstacles, self.gravity)]
 
     def undo(self) -> None:
         """Goes back to before the last change, or to the earliest frame kept. Raises ConfigError without a change."""
-        self._before = [before for before in self._before if before[0] <= self.frame]
-        require(bool(self._before), "undo", "used after a change", "none")
-        frame, obstacles, gravity = self._before.pop()
+        require(bool(self.undoable), "undo", "used after a change", "none")
+        frame, obstacles, gravity = self.undoable.pop()
         self.rewind(max(frame, self.recording.earliest))
         self._set_obstacles(obstacles)
         if gravity != self.gravity:

@@ -215,6 +215,7 @@ def test_changes_are_undone_one_by_one(session):
     steps(session, 1)
     session.remember()
     session.rewind(2)
+    steps(session, 3)
     with pytest.raises(ConfigError, match="undo must be used after a change"):
         session.undo()
 

@@ -107,7 +107,8 @@ def test_bad_input_is_answered(page, messages, action, message):
 
     def state():
         session = page.session
-        return len(session.obstacles), session.live.particle_count, session.gravity, list(page.loaded)
+        undoable = len(session.undoable)
+        return len(session.obstacles), session.live.particle_count, session.gravity, list(page.loaded), undoable
 
     before = state()
     sent(page, lambda: action(page))
@@ -143,7 +144,7 @@ def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, cap
     """An unexpected error is told to its viewer and printed with its trace; no other action is lost."""
 
     def fail():
-        raise error
+        raise type(error)("x")  # `error` would keep its trace, and with it the frames' values
 
     done = []
     page.do(fail)
