@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_058,
+    "hgn": 34_090,
     "datagen": 8_991,
     "tools": 6_353,
-    "tests": 34_379,
+    "tests": 34_446,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -96,7 +96,7 @@ def relative_features(
         ],
         dim=-1,
     )
-    local, touch_N = config.body_cells, surface_gate(wall_N6, normal_N6)
+    local, touch_N = config.body_cells, surface_gate(wall_N6, normal_N6, config.obstacle_distance)
     normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6, local), grid)
     disturbed_C, touched_C = disturbance(motion_NK, touch_N, grid)
     if surface_N3 is not None:
@@ -167,12 +167,18 @@ def obstacle_surfaces(
     return torch.cat([here_NV, ahead_NV], dim=-1)
 
 
-def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns contacts of particles [N]: twice the largest nearness of a wall or length of a normal, at most 1."""
+def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distance: bool) -> torch.Tensor:
+    """Returns contacts of particles [N]: 1 with an obstacle normal, else twice the largest wall nearness, at most 1.
+
+    With `distance` (network.obstacle_distance) the length of a normal is its nearness, and counts as that of a wall.
+    """
     near_N = wall_N6.amax(-1)
-    if normal_N6 is not None:
+    if normal_N6 is None:
+        return (2 * near_N).clamp(max=1)
+    if distance:
         near_N = torch.maximum(near_N, normal_N6.unflatten(1, (2, 3)).norm(dim=-1).amax(-1))
-    return (2 * near_N).clamp(max=1)
+        return (2 * near_N).clamp(max=1)
+    return torch.where(normal_N6.any(-1), 1, (2 * near_N).clamp(max=1))
 
 
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, local: bool) -> torch.Tensor:

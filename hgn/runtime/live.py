@@ -214,13 +214,16 @@ class LiveSimulation:
         before, scenes, barriers = self.scenes[index], [*self.scenes], [*self._barriers]
         scenes[index] = scene
         changed: dict[str, Any] = {}
-        if scene.obstacle_grid is not before.obstacle_grid:
+        other_solid = _solid(scene) != _solid(before)
+        if (
+            scene.obstacle_grid is not before.obstacle_grid or other_solid
+        ):  # with obstacle_distance cells depend on both
             changed["obstacles"] = self.simulator.obstacles(scenes)
         if restart or scene.moving is not before.moving:
             frames = [0] * len(scenes) if kept.moving is None else [*kept.moving.frames]
             frames[index] = 0
             changed["moving"] = self.simulator.moving(scenes, frames)
-        if barriers and _solid(scene) != _solid(before):
+        if barriers and other_solid:
             barriers[index] = scene.barrier(barriers[index].clearance)
             changed["barriers"] = self._joined(barriers)
         for name in ("domain_S3", "gravity_S3", "wall_friction_S3"):
@@ -254,5 +257,5 @@ def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
 
 def _solid(scene: InitialState) -> tuple[Any, ...]:
-    """Returns the values on which a scene's barrier depends."""
+    """Returns the values on which a scene's barrier and field of distances depend."""
     return scene.corners, scene.domain_size, scene.obstacle_grid.cell_size

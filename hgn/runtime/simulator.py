@@ -131,7 +131,7 @@ class InitialState:
     def field(self) -> ObstacleGrid:
         """Returns hgn.scene.surface_field around the obstacles at rest."""
         corner_F33 = np.zeros((0, 3, 3)) if self.corners is None else self.corners()
-        return field_around(self.obstacle_grid, corner_F33, self.domain_size, self.dimensions)
+        return field_around(self.obstacle_grid, corner_F33, self.domain_size)
 
     def surfaces(self, distance: bool) -> ObstacleGrid:
         """Returns the field with `distance` (network.obstacle_distance), else the paper's cells."""

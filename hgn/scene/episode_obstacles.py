@@ -3,6 +3,7 @@
 Shape legend: K obstacle cells, F triangles.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -35,8 +36,12 @@ def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
 
     A random scene's meshes are rebuilt from its specification. Other scenes, or a missing mesh file, give none.
     """
-    records = episode.specification.get("obstacles", ())
-    if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
+    return _known(episode.specification)
+
+
+def _known(specification: Mapping[str, Any]) -> tuple[Obstacle, ...] | None:
+    records = specification.get("obstacles", ())
+    if specification.get("kind") != "random" or not all(_is_here(record) for record in records):
         return None
     return tuple(
         obstacle_of_record(record, f"obstacle_{index}_{Path(record['shape']).stem}")
@@ -59,18 +64,24 @@ def _is_here(record: dict[str, Any]) -> bool:
     return Path(shape).is_file() and mesh_sha256(shape) == record.get("sha256")
 
 
-@lru_cache(maxsize=256)
 def field_of_episode(episode: Episode) -> ObstacleGrid:
     """Returns hgn.scene.surface_field of an episode's obstacles at rest. The last ones are cached."""
-    still = [obstacle for obstacle in known_obstacles(episode) or () if obstacle.motion is None]
-    return field_around(episode.obstacle_grid, all_corners(still), episode.domain_size, episode.dimensions)
+    return _field(episode.obstacle_grid, json.dumps(episode.specification), tuple(episode.domain_size))
 
 
-def field_around(grid: ObstacleGrid, corner_F33: np.ndarray, domain_size: Vector, dimensions: int) -> ObstacleGrid:
-    """Returns hgn.scene.surface_field of triangles, or of the squares of `cell_obstacles` if there are none."""
-    if not len(corner_F33):
-        corner_F33 = all_corners(cell_obstacles(grid, domain_size[2] / 2 if dimensions == 2 else None))
-    return surface_field(grid, corner_F33, domain_size)
+@lru_cache(maxsize=256)
+def _field(grid: ObstacleGrid, specification: str, domain_size: Vector) -> ObstacleGrid:
+    """Does not take the episode, because the cache would keep its positions in memory."""
+    still = [obstacle for obstacle in _known(json.loads(specification)) or () if obstacle.motion is None]
+    return field_around(grid, all_corners(still), domain_size)
+
+
+def field_around(grid: ObstacleGrid, corner_F33: np.ndarray, domain_size: Vector) -> ObstacleGrid:
+    """Returns hgn.scene.surface_field of triangles, or of the squares of `cell_obstacles` if there are none.
+
+    A 2D set has the squares across the normals too: at their middles they are the section with its plane.
+    """
+    return surface_field(grid, corner_F33 if len(corner_F33) else all_corners(cell_obstacles(grid)), domain_size)
 
 
 def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:

@@ -15,6 +15,7 @@ from hgn.data.batch import make_batch
 from hgn.network.barriers import Barriers
 from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.relative import surface_gate
 from hgn.runtime.differentiable import Pose
 from hgn.runtime.live import LiveSimulation
 from hgn.runtime.simulator import InitialState, Simulator
@@ -118,6 +119,14 @@ def test_several_motions_and_a_boost():
     assert float((first - still).abs().max()) > 1e-5
     state, without = held(struck(), plates([COMMON])), network_for(levels=3, own_physics=("friction",))
     assert torch.equal(network(state), without(state)) and network.parameter_count == without.parameter_count
+
+
+@pytest.mark.parametrize(("distance", "expected"), [(False, [1.0, 1.0, 0.6, 0.0]), (True, [0.2, 1.0, 0.6, 0.0])])
+def test_contact_where_normals_almost_cancel(distance, expected):
+    """In cells of two obstacles a sum of normals may be short. Only with distances a short normal is far away."""
+    wall_N6, normal_N6 = torch.zeros(4, 6), torch.zeros(4, 6)
+    normal_N6[0, 1], normal_N6[1, 3], wall_N6[2, 0] = 0.1, -0.8, 0.3
+    torch.testing.assert_close(surface_gate(wall_N6, normal_N6, distance), torch.tensor(expected))
 
 
 def test_symmetries_of_the_cube():

@@ -147,6 +147,16 @@ def test_barriers_stay_where_obstacles_do(monkeypatch):
         assert live.state.barriers is not barriers and sum(built) == 4
 
 
+def test_distances_follow_the_triangles():
+    """A scene in whose place comes one with the same cells and other triangles shows the distances of its own."""
+    network = network_of(torch.float32, inputs="relative", obstacle_distance=True)
+    low, high = (replace(scene(5), corners=lambda y=y: square((0.6, y, 0.6), 1, 0.6)) for y in (0.45, 0.46))
+    with LiveSimulation(Simulator(network, 60.0), low) as live:
+        live.reset(0, replace(high, obstacle_grid=low.obstacle_grid))
+        expected = Simulator(network, 60.0).start([high]).obstacles
+        torch.testing.assert_close(live.state.obstacles.distance_K, expected.distance_K, rtol=0, atol=0)
+
+
 def test_gravity_changes_between_frames():
     """Relative inputs: a lone particle falls on under the new gravity from the velocity that it had, by the closed
     form of the frame's integration: v += g dt^2, x += v."""

@@ -1,17 +1,21 @@
 """The field of distances around obstacles: what a network with obstacle_distance sees of surfaces."""
 
+import weakref
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from scene.test_episode import make_episode
 from scipy.spatial import Delaunay
 
 from hgn.config import NetworkConfig
 from hgn.network.obstacles import ObstacleCells
+from hgn.runtime.simulator import InitialState
 from hgn.scene.distance import closest_points
-from hgn.scene.obstacle_grid import build_obstacle_grid
+from hgn.scene.episode_obstacles import field_of_episode
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.shapes import shape_obstacle
@@ -96,6 +100,50 @@ def test_no_obstacle():
     grid = build_obstacle_grid([], CELL, 0)
     field = surface_field(grid, np.zeros((0, 3, 3)), (1.0, 1.0, 1.0))
     assert len(field.cell_K3) == len(field.normal_K3) == len(field.distance_K) == 0
+
+
+def test_triangles_without_area_are_not_seen():
+    """As in the paper's cells, a triangle that is a point or a line is no surface."""
+    plate = shape_obstacle("square", 0.2, (0.5, 0.3, 0.5))
+    corner_F33 = np.array([[[0.2, 0.8, 0.2]] * 3, [[0.1, 0.9, 0.5], [0.8, 0.9, 0.5], [0.3, 0.9, 0.5]]])
+    grid = build_obstacle_grid([plate], CELL, 0)
+    field, both = (surface_field(grid, np.concatenate([plate.corners, more])) for more in (corner_F33[:0], corner_F33))
+    np.testing.assert_array_equal(both.cell_K3, field.cell_K3)
+    assert len(surface_field(grid, corner_F33).cell_K3) == 0
+
+
+def test_a_long_way_between_surfaces_takes_no_memory():
+    """Two plates a hundred units apart, which a moving obstacle may have, have the cells of each of them."""
+    near, far = (shape_obstacle("square", 0.1, (x, x, x)) for x in (0.5, 100.5))
+    both = [near, far]
+    first, second, field = (
+        surface_field(build_obstacle_grid(own, CELL, 0), all_corners(own)) for own in ([near], [far], both)
+    )
+    np.testing.assert_array_equal(field.cell_K3, np.concatenate([first.cell_K3, second.cell_K3]))
+    np.testing.assert_array_equal(first.cell_K3 + 6400, second.cell_K3)
+
+
+def test_a_flat_set():
+    """In a 2D set, whose meshes are not known, surfaces are across the normals of their cells."""
+    normal_K3 = np.array([[0, 1, 0], [0, 1, 0], [0.6, 0.8, 0]], np.float32)
+    grid = ObstacleGrid(0.1, np.array([[2, 3, 0], [3, 3, 0], [8, 3, 0]], np.int32), normal_K3)
+    flat = {"dimensions": 2, "kind": "imported"}
+    episode = replace(make_episode(cells=0, specification=flat), obstacle_grid=grid, domain_size=(1.0, 1.0, 0.1))
+    place_N3 = torch.tensor([[0.3, 0.45, 0.05], [0.3, 0.25, 0.05], [0.85 + 0.06, 0.35 + 0.08, 0.05]])
+    expected_N3 = [[0, 0.5, 0], [0, -0.5, 0], [0.3, 0.4, 0]]
+    state = InitialState.of_episode(episode)
+    for field in (field_of_episode(episode), state.field):
+        seen_N3 = ObstacleCells.of([field]).normals(place_N3, torch.zeros(3, dtype=torch.int64))
+        np.testing.assert_allclose(seen_N3, expected_N3, atol=1e-5)
+
+
+def test_the_cached_fields_keep_no_episode():
+    """Positions of an episode have up to hundreds of megabytes."""
+    episode = make_episode(cells=3)
+    field, gone = field_of_episode(episode), weakref.ref(episode)
+    assert field_of_episode(replace(episode, key="other")) is field
+    del episode
+    assert gone() is None
 
 
 def test_outside_the_domain_nothing_is_kept():

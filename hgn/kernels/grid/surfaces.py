@@ -106,10 +106,13 @@ def surfaces_of(
             value = with_column(value, 6 + i if i < 3 else 12, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
             there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
             value = with_column(value, 9 + i if i < 3 else 13, there)
-        for first in tl.static_range(6, 12, 3):
-            length = tl.sum(tl.where((column >= first)[None, :] & (column < first + 3)[None, :], value * value, 0.0), 1)
-            near = tl.maximum(near, tl.sqrt_rn(length))
-        touch = tl.minimum(2 * near, 1.0)
+        if REACH > 0:
+            for first in tl.static_range(6, 12, 3):
+                of_normal = (column >= first)[None, :] & (column < first + 3)[None, :]
+                near = tl.maximum(near, tl.sqrt_rn(tl.sum(tl.where(of_normal, value * value, 0.0), 1)))
+            touch = tl.minimum(2 * near, 1.0)
+        else:
+            touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
         if MOVING > 0:
             here = tl.max((found & (quarters == 0)).to(tl.int32), 1) > 0
             met = found & (quarters == tl.where(here, 0, ahead)[:, None])
