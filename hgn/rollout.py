@@ -154,12 +154,14 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(printable(config.data)).name, "episode": str(config.episode)}
-    limit = simulator.info.maximum_initial_speed
+    limit, relative = simulator.info.maximum_initial_speed, simulator.info.network.relative
     fastest = float(np.linalg.norm(initial.velocity_N3.astype(np.float64), axis=-1).max(initial=0.0))
-    if limit is not None and fastest > limit * (1 + SAME_SPEED):
+    if not (relative and limit is None) and fastest > (limit or 0.0) * (1 + SAME_SPEED):
+        known = "an unknown speed; " if limit is None else f"up to {limit:g}; beyond that "
+        flight = "motion is a guess, and exact with weights=own_physics in flight"
         print(
             f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "
-            f"{weights.stem} with up to {limit:g}; beyond that collisions and contacts are a guess",
+            f"{weights.stem} with {known}{'collisions and contacts are a guess' if relative else flight}",
             file=sys.stderr,
         )
     print(simulator.backend.note, file=sys.stderr)

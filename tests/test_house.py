@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_090,
+    "hgn": 34_092,
     "datagen": 8_991,
     "tools": 6_353,
-    "tests": 34_446,
+    "tests": 34_453,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

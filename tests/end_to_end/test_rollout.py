@@ -131,18 +131,25 @@ def test_particles_inside_obstacles_are_reported(tmp_path, weights, capsys):
 
 
 def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
-    """Where the weights know how fast groups of their data began, a faster one is simulated and a line gives both."""
-    config = NetworkConfig(width=8, levels=2, message_passing_steps=1)
-    still = silent(build_network(config))
+    """Where the weights know how fast groups of their data began, a faster one is simulated and a line gives both.
+    Absolute inputs are a guess in flight too, and where the speed is unknown."""
     file, scene = tmp_path / "still.safetensors", tmp_path / "fast.yaml"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, velocity: [3, 0, -4]}"
     scene.write_text(f"groups: [{group}]\n")
-    for known, wanted in ((None, False), (5.0, False), (5 - 1e-6, False), (3.0, True)):
-        save_weights(file, still, WeightsInfo(config, 60.0, 1 / 64, maximum_initial_speed=known))
+    contact, flight = "collisions and contacts are a guess\n", "motion is a guess, and exact with weights=own_physics"
+    for inputs, known, wanted in (
+        ("relative", None, None), ("relative", 5.0, None), ("relative", 5 - 1e-6, None),
+        ("relative", 3.0, f"up to 3; beyond that {contact}"), ("absolute", 5.0, None),
+        ("absolute", 3.0, f"up to 3; beyond that {flight}"), ("absolute", None, f"an unknown speed; {flight}"),
+    ):  # fmt: skip
+        config = NetworkConfig(width=8, levels=2, message_passing_steps=1, inputs=inputs)
+        info = WeightsInfo(config, 60.0, 1 / 64, maximum_initial_speed=known)
+        save_weights(file, silent(build_network(config)), info)
         given = {"weights": str(file), "frames": 2, "scene": str(scene), "out": str(tmp_path / "a.vtkhdf")}
         assert rollout.main(given) == 0
-        line = "velocity: groups begin with up to 5 domain units per second, those of the data of still with up to 3;"
-        assert (line in capsys.readouterr().err) == wanted
+        line = "velocity: groups begin with up to 5 domain units per second, those of the data of still with "
+        said = capsys.readouterr().err
+        assert f"{line}{wanted}" in said if wanted else line not in said
     scene.write_text(f"groups: [{group.replace('3, 0, -4', '1e38, 0, 1e38')}]\n")
     with pytest.raises(ConfigError, match="diverged at frame 1"):  # without a warning of NumPy
         rollout.main(given)
