@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_092,
+    "hgn": 34_089,
     "datagen": 8_991,
     "tools": 6_353,
     "tests": 34_453,

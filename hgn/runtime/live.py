@@ -215,9 +215,8 @@ class LiveSimulation:
         scenes[index] = scene
         changed: dict[str, Any] = {}
         other_solid = _solid(scene) != _solid(before)
-        if (
-            scene.obstacle_grid is not before.obstacle_grid or other_solid
-        ):  # with obstacle_distance cells depend on both
+        # with obstacle_distance cells depend on both
+        if scene.obstacle_grid is not before.obstacle_grid or other_solid:
             changed["obstacles"] = self.simulator.obstacles(scenes)
         if restart or scene.moving is not before.moving:
             frames = [0] * len(scenes) if kept.moving is None else [*kept.moving.frames]

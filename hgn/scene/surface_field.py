@@ -50,10 +50,8 @@ def surface_field(grid: ObstacleGrid, corner_F33: np.ndarray, domain_size: Vecto
         return replace(grid, cell_K3=grid.cell_K3[:0], normal_K3=grid.normal_K3[:0], friction_K=None, distance_K=_NONE)
     point_S3, owner_S = (np.concatenate(part) for part in zip(*parts, strict=True))
     cell_K3 = _around(np.floor(point_S3 / size).astype(np.int64))
-    tree, gap = (
-        cKDTree(point_S3, leafsize=LEAF_POINTS, compact_nodes=False, balanced_tree=False),
-        size / POINTS_PER_CELL,
-    )
+    tree = cKDTree(point_S3, leafsize=LEAF_POINTS, compact_nodes=False, balanced_tree=False)
+    gap = size / POINTS_PER_CELL
     farthest = FARTHEST_CELLS * size + gap
     # a point farther than `gap` behind the nearest one belongs to no nearer triangle
     distance_KC, nearest_KC = tree.query((cell_K3 + 0.5) * size, k=CANDIDATES, distance_upper_bound=farthest + gap)
