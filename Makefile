@@ -49,7 +49,7 @@ demo: $(VENV)/.demo
 	@echo "weights: $(DEMO)/weights.safetensors"
 	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"
 	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif: a scene that the network was not"
-	@echo "trained on; above its prediction, below the solver: bodies fall and meet on the obstacle alike;"
+	@echo "trained on; above or left its prediction, below or right the solver: bodies meet on the obstacle alike;"
 	@echo "on the floor the water of so small a network spreads less evenly than the solver's."
 
 test: setup

@@ -218,7 +218,8 @@ def near_name(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
 
 def near_file(path: Path) -> str:
     """Returns `did you mean NAME?` for a similar file in the folder of `path`, or an empty text."""
-    names = {each.name for each in path.parent.glob("*") if each.suffix[:3] == path.suffix[:3]}
+    ending = path.suffix.replace("yml", "yaml")[:3]
+    names = {each.name for each in path.parent.glob("*") if each.suffix.replace("yml", "yaml")[:3] == ending}
     return near_name(path.name, names - {path.name}, 0.8)
 
 

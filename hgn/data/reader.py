@@ -414,4 +414,5 @@ def find_episode(folder: Path | str, key: str) -> Episode:
         for place, entry in enumerate(store.entries):
             if entry.key == key:
                 return store.read(place)
-    raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}")
+    some = "".join(f"; for example {entry.key}" for entry in islice(store.entries, 1))
+    raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}{some}")

@@ -19,10 +19,11 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """
     mapping = {key: dict(value) if isinstance(value, Mapping) else value for key, value in mapping.items()}
     folder, asked = mapping["dataset"]["folder"], bool(mapping.get("imported"))
-    manifest = Manifest.load(folder) if asked or EpisodeStore.available(folder) else None
+    manifest = Manifest.load(folder) if EpisodeStore.available(folder) else None
     own = manifest.config.get("imported") if manifest is not None else None
     if own is None:
-        require(not asked, "dataset.folder", "a data set of python -m hgn.import_trajectories", folder)
+        remedy = "run it with from=FOLDER out=data/mine, and set dataset.folder=data/mine"
+        require(not asked, "dataset.folder", "a data set of python -m hgn.import_trajectories", folder, remedy=remedy)
         return mapping
     rule = f"one of python -m datagen without {FLAG}"
     require(asked, "dataset.folder", rule, folder, remedy=f"it is imported; add {FLAG}, or take another folder")

@@ -14,7 +14,7 @@ from hgn.system.ranks import first_rank
 # After several signals the last one in this order determines the exit code. A scheduler that sent SIGUSR1 queues the
 # job again, and may send SIGTERM too.
 BY_WEIGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-STOPPING = b"\nstopping: an update that runs is completed and saved; a further Ctrl-C ends the command at once\n"
+STOPPING = b"\nstopping: an update that runs is completed and saved; Ctrl-C (SIGINT) then ends the command at once\n"
 
 
 class StopRequest:

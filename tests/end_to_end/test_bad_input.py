@@ -57,6 +57,11 @@ VALUES = [
     ("train", ["network.obstacle_features=false"], "network.obstacle_features must be true for scenes with obst"),
     ("train", ["network.materials=[lava]"], "network.materials must be all of scene.materials, got ['lava']"),
     ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative where scene.kinds are given, or"),
+    (
+        "train",
+        ["+experiment=imported"],
+        "import_trajectories, got 'data/imported'; run it with from=FOLDER out=data/min",
+    ),
     ("train", ["training=[1]"], "settings must be as Hydra reads them, got training=[1] (TypeError: "),
     *(
         (command, [f"~{key}"], f"error: {key.partition('=')[0]} must be kept, got '~{key}'; leave it out, or")
@@ -121,6 +126,7 @@ VALUES = [
     ),
     ("rollout", ["frame=3"], "frame is not a known key; did you mean frames?"),
     ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
+    ("rollout", [*ROLLOUT, "scene=scene.yml"], "existing YAML file, got scene.yml; did you mean scene.yaml?"),
     ("rollout", ["out=a.png"], "must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, go"),
     ("rollout", ["data=data", "episode=99"], "episode must begin with one of train, validation, test, got '99'; e.g. "),
     ("rollout", [*ROLLOUT, "weights=run"], "got run; write one with python -m hgn.export checkpoint=run/checkpoints/"),

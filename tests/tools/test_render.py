@@ -61,7 +61,7 @@ def test_an_episode_and_rollouts_beside_it(tmp_path, small_dataset):
     assert widths[2] == pytest.approx(1.5 * widths[1], abs=4)
     with pytest.raises(ConfigError, match="names must be given where others have the same file name"):
         main(mapping | {"others": [str(tmp_path / "a.vtkhdf")] * 2, "out": str(tmp_path / "bad")})
-    with pytest.raises(ConfigError, match="one of the 2 validation episodes"):
+    with pytest.raises(ConfigError, match=r"one of the 2 validation episodes in .*; for example validation-000000$"):
         main(mapping | {"episode": "validation-000009", "out": str(tmp_path / "bad")})
 
 

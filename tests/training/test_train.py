@@ -303,9 +303,8 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         stop = StopRequest()
         for number in order:
             stop._on_signal(number, None)
-        assert (
-            stop.exit_code == 138 and capfd.readouterr().err.count("a further Ctrl-C ends the command at once") == lines
-        )
+        told = "completed and saved; Ctrl-C (SIGINT) then ends the command at once\n"
+        assert stop.exit_code == 138 and capfd.readouterr().err.count(told) == lines
 
 
 @pytest.mark.parametrize(
