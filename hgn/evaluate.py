@@ -15,7 +15,7 @@ from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig, Split
 from hgn.data.fresh import set_record
 from hgn.data.manifest import errors_in_config
 from hgn.data.reader import EpisodeStore, first_episodes
-from hgn.scene.distance import fraction_inside
+from hgn.scene.distance import fraction_inside, outside_domain
 from hgn.scene.episode import Episode
 from hgn.schema import Bounded, FileName, NonNegative, Positive, from_mapping
 from hgn.system.files import require_place, write_json
@@ -156,14 +156,13 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
     time_s = last / episode.frame_rate_hz
     position_N3 = trial.position_TN3[last]
-    beyond_N3 = (position_N3 < 0) | (position_N3 > np.asarray(episode.domain_size))
     return {
         "episode": episode.key,
         "frames": trial.frame_count,
         "cause": trial.cause,
         "penetration": fraction_inside(position_N3, obstacles, time_s),
         "reference_penetration": fraction_inside(np.asarray(episode.position_TN3[last]), obstacles, time_s),
-        "outside_domain": float(beyond_N3.any(-1).mean()),
+        "outside_domain": outside_domain(position_N3, episode.domain_size),
     }
 
 
@@ -172,7 +171,9 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
     from hgn.training.errors import format_ratio
 
     every = "every frame" if config.frame_stride == 1 else f"every {config.frame_stride}th frame"
-    lines = [f"{config.split}, {scenes} scenes, {every}; sum over axes, mean over particles, frame units"]
+    lines = [
+        f"{config.split}, {scenes} scene{'s' * (scenes > 1)}, {every}; sum over axes, mean over particles, frame units"
+    ]
     lines.append(f"{'predictor':<20} {'one-step MSE':>12}  by material")
     for row in rows:
         if "one_step_mse" in row:

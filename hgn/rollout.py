@@ -1,6 +1,7 @@
-"""python -m hgn.rollout: simulates a random scene, or the scene of scene=…, and draws pictures.
+"""python -m hgn.rollout: simulates a random scene, or the scene of scene=….
 
-The weights are shipped ones, or those of weights=…. The result is a VTKHDF file, with pictures in the same folder.
+The weights are shipped ones, or those of weights=…. The result is a VTKHDF file, with pictures in the same folder:
+always without out=…, and with it only if render=true.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from hgn.command import require_rollout_name, run_command
 from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig
 from hgn.render import PLY_ENDING
-from hgn.scene.distance import fraction_inside
+from hgn.scene.distance import fraction_inside, outside_domain
 from hgn.scene.emission import entry_frames
 from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
 from hgn.scene.random_scene import generate_scene
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 PICTURES = 4  # number of pictures in the PNG
 EVERY = 3  # smallest number of frames of the rollout for one picture of the GIF
 FASTEST = 50  # largest number of pictures per second that viewers of GIFs show
-REPORTED_INSIDE = 0.01  # smallest fraction of particles inside obstacles that is reported
+REPORTED = 0.01  # smallest fraction of particles inside obstacles, or beyond the domain, that is reported
 SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; velocities are stored in float32
 
 
@@ -59,7 +60,9 @@ class RolloutConfig(SimulatorConfig):
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
     out: str | None = None
     surface: bool = False  # also write water as a closed surface, in USD and PLY
-    render: bool | None = None  # also draw a PNG and a GIF in the folder of the file; null: if out is null
+    render: bool | None = (
+        None  # also draw a PNG and a GIF in the folder of the file; null: yes without out, no with out
+    )
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene, or an episode
     scene: str | None = None
     # seed of a random scene, drawn as the training scenes; null: 13, where all materials fall on obstacles
@@ -101,8 +104,10 @@ def main(mapping: dict[str, Any]) -> int:
     last = result.frame_count - 1
     present_N3 = result.position_TN3[last, : result.present(last)]
     inside = fraction_inside(present_N3, result.obstacles, last / result.frame_rate_hz)
-    if inside > REPORTED_INSIDE:
-        print(f"inside obstacles: {inside:.1%} of the particles in the last frame", file=sys.stderr)
+    beyond = outside_domain(present_N3, result.domain_size)
+    for place, fraction in (("inside obstacles", inside), ("beyond the domain", beyond)):
+        if fraction > REPORTED:
+            print(f"{place}: {fraction:.1%} of the particles in the last frame", file=sys.stderr)
     print(path)
     if drawn:
         write_picture(still, compare_picture(result, spread(result.frame_count, PICTURES)), result.source)

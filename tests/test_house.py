@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_089,
+    "hgn": 34_104,
     "datagen": 8_991,
-    "tools": 6_353,
-    "tests": 34_453,
+    "tools": 6_348,
+    "tests": 34_460,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -51,9 +51,3 @@ def neighbours(position_N3: np.ndarray, radius: float) -> float:
         return 0.0
     tree = cKDTree(position_N3)
     return float(tree.count_neighbors(tree, radius)) / len(position_N3) - 1
-
-
-def outside_domain(position_N3: np.ndarray, domain_size: Sequence[float]) -> float:
-    """Returns the fraction of particles outside of the domain."""
-    outside_N3 = (position_N3 < 0) | (position_N3 > np.asarray(domain_size))
-    return float(outside_N3.any(-1).mean()) if len(position_N3) else 0.0

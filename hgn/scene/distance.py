@@ -91,6 +91,12 @@ def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle], time
     return float(inside_N.mean()) if len(inside_N) else 0.0
 
 
+def outside_domain(position_N3: np.ndarray, domain_size: Sequence[float]) -> float:
+    """Returns the fraction of particles outside of the domain."""
+    outside_N3 = (position_N3 < 0) | (position_N3 > np.asarray(domain_size))
+    return float(outside_N3.any(-1).mean()) if len(position_N3) else 0.0
+
+
 def _closest_of_axes(point: np.ndarray, corner: np.ndarray) -> np.ndarray:
     """Computes `closest_points` with an array for each axis: points [3, P], corners [3, 3, P]."""
     a, b, c = corner

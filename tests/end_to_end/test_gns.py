@@ -13,7 +13,7 @@ from hgn.schema import ConfigError
 GNS = {"levels": 1, "message_passing_steps": 2, "width": 8}
 
 
-def test_every_command_takes_the_baseline(data, tmp_path):
+def test_every_command_takes_the_baseline(data, tmp_path, capsys):
     """GNS is trained, resumed, exported, simulated and evaluated by the HGN's commands; fp16 is refused."""
     network = GNS | {"kind": "gns"}
     run = tmp_path / "run"
@@ -33,4 +33,5 @@ def test_every_command_takes_the_baseline(data, tmp_path):
     assert rollout.main(place | {"episode": "validation-000000", "frames": 4, "out": str(out)}) == 0
     report = tmp_path / "errors.json"
     assert evaluate.main(place | {"scenes": 1, "rollout_frames": 4, "json": str(report)}) == 0
+    assert capsys.readouterr().out.count("validation, 1 scene, every frame;") == 1
     assert out.is_file() and json.loads(report.read_text())["rows"][0]["one_step_mse"] > 0

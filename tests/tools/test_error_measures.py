@@ -17,7 +17,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.runtime.backend import build
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.distance import fraction_inside
+from hgn.scene.distance import fraction_inside, outside_domain
 from hgn.scene.motion import Motion
 from hgn.scene.shapes import shape_obstacle
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
@@ -27,7 +27,7 @@ from tools.error_vs_time.paired import paired_difference, paired_rows, paired_ta
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.run import draw
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
-from tools.measures import energies, energy_scale, momentum_error, outside_domain
+from tools.measures import energies, energy_scale, momentum_error
 from tools.timing import FrameClock
 
 CPU = torch.device("cpu")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from hgn.runtime.rollouts import RolloutResult
-from hgn.scene.distance import fraction_inside
+from hgn.scene.distance import fraction_inside, outside_domain
 from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import obstacles_of_episode
 from hgn.scene.material import MATERIALS
@@ -21,7 +21,7 @@ from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
 from tools import report
 from tools.error_vs_time.contenders import Contender, OneStep
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
-from tools.measures import momentum_error, outside_domain
+from tools.measures import momentum_error
 
 FRAME_STRIDE = 10  # one-step errors are measured on every tenth frame
 BATCH_SCENES = 8  # number of rollouts that are simulated side by side

@@ -12,8 +12,9 @@ import numpy as np
 from hgn.network.relative import CONTACT_REACH_CELLS
 from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState
+from hgn.scene.distance import outside_domain
 from hgn.training.errors import position_mse
-from tools.measures import energies, energy_scale, neighbours, outside_domain
+from tools.measures import energies, energy_scale, neighbours
 from tools.stability.case import Outcome
 
 EARTH = 9.8  # domain units per second squared
