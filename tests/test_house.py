@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_104,
+    "hgn": 34_105,
     "datagen": 8_991,
     "tools": 6_348,
-    "tests": 34_460,
+    "tests": 34_464,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

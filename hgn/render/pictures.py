@@ -20,12 +20,12 @@ from hgn.render.flat import FlatStage
 from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
 from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import obstacles_of_episode
-from hgn.scene.group import WALL_CELLS
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import ConfigError, require
 from hgn.system.files import WRITTEN_BY_HGN, write_atomically
 
 RADIUS_IN_SPACINGS = 0.72  # the spheres overlap a little, so that they look like a body
+REST_CELLS = 1.5  # largest thickness of walls that are not drawn: the solver bounds its particles there
 TEXT_COLOR = (45, 50, 60)
 PALETTE_SAMPLES = 40_000
 WEBP_QUALITY = 70  # at 50 small particles smear, and at 90 the file is as large as a GIF
@@ -196,9 +196,10 @@ def _stage(rollout: Rollout, size: int) -> Stage:
     radius = min(radius, 0.03 * min(rollout.domain_size[: rollout.dimensions]))
     if rollout.dimensions == 2:
         return FlatStage(rollout.domain_size, rollout.obstacles, radius, size)
-    first_N3 = rollout.position_TN3[:: max(1, rollout.frame_count // 50), : rollout.present(0)].reshape(-1, 3)
-    nearest = np.nanmin(np.minimum(first_N3, np.array(rollout.domain_size) - first_N3), initial=np.inf)
-    wall = min(max(0.0, float(nearest) - radius), WALL_CELLS * rollout.cell_size)
+    known_TN3 = rollout.position_TN3[:1] if rollout.reference_TN3 is None else rollout.reference_TN3
+    known_N3 = known_TN3[:: max(1, len(known_TN3) // 50), : rollout.present(0)].reshape(-1, 3)
+    nearest = np.nanmin(np.minimum(known_N3, np.array(rollout.domain_size) - known_N3), initial=np.inf)
+    wall = min(max(0.0, float(nearest) - radius), REST_CELLS * rollout.cell_size)
     return Stage(rollout.domain_size, rollout.obstacles, radius, size, wall)
 
 

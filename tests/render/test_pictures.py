@@ -164,14 +164,18 @@ def test_frames_and_rates_that_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("lowest", "wall"), [(0.3, 3 / 64), (0.05, 0.05), (3 / 64, 3 / 64), (0.02, 0.02), (-0.1, 0.0)])
-def test_the_floor_is_where_particles_rest(lowest, wall):
-    """The box is drawn without the walls, at most three cells thick, that no particle enters; material lies on it."""
-    rollout = falling_blobs()
-    at_N3 = np.clip(rollout.position_TN3, 0.3, 0.7)
-    at_N3[-1, 0, 1] = lowest
-    stage = _stage(dataclasses.replace(rollout, position_TN3=at_N3, cell_size=1 / 64), 120)
-    assert stage.wall == pytest.approx(min(max(0.0, wall - stage.radius) if wall == lowest else wall, 3 / 64))
+@pytest.mark.parametrize(("lowest", "wall"), [(0.3, 1.5 / 64), (0.05, 1.5 / 64), (0.02, 0.02), (-0.1, 0.0)])
+@pytest.mark.parametrize("with_truth", [False, True])
+def test_the_floor_is_where_particles_rest(lowest, wall, with_truth):
+    """The box is drawn without the walls, at most 1.5 cells thick, that no particle of the ground truth, or else of the
+    first frame, enters. So it is the same for all predictions of a scene."""
+    rollout = falling_blobs(30, 30)
+    truth_TN3, at_N3 = np.clip(rollout.position_TN3, 0.3, 0.7), np.clip(rollout.position_TN3, 0.3, 0.7)
+    (truth_TN3[-1] if with_truth else at_N3[0])[0, 1] = lowest
+    at_N3[-1, 0] = 0.001
+    scene = dataclasses.replace(rollout, position_TN3=at_N3, cell_size=1 / 64)
+    stage = _stage(dataclasses.replace(scene, reference_TN3=truth_TN3 if with_truth else None), 120)
+    assert stage.wall == pytest.approx(max(0.0, wall - stage.radius) if wall == lowest else wall)
     assert stage.domain_size[1] == pytest.approx(1 - 2 * stage.wall)
 
 
