@@ -16,12 +16,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_105,
+    "hgn": 34_106,
     "datagen": 8_991,
     "tools": 6_348,
     "tests": 34_464,
 }
-SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES: dict[str, int] = {}

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hgn.scene.distance import closest_points
 from hgn.scene.obstacle_grid import ObstacleGrid, lexicographic_keys
@@ -39,6 +38,8 @@ def surface_field(grid: ObstacleGrid, corner_F33: np.ndarray, domain_size: Vecto
     are measured. Zero-area triangles are skipped.
     Raises: ConfigError for a surface that is too large.
     """
+    from scipy.spatial import cKDTree
+
     size, box = grid.cell_size, None
     if domain_size is not None:
         margin = (FARTHEST_CELLS + 1) * size
