@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_106,
     "datagen": 8_991,
     "tools": 6_348,
-    "tests": 34_464,
+    "tests": 34_474,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

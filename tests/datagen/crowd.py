@@ -5,6 +5,7 @@ The stand-in for the solver generates, so that the service is what is measured. 
 """
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import os
@@ -15,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 from unittest import mock
+from urllib.request import urlopen
 
 import numpy as np
 from processes import TESTS, free_port, start_module, wait_until
@@ -74,12 +76,19 @@ async def probe(port, until):
     while time.monotonic() < until:
         start = time.perf_counter()
         stream = await asyncio.open_connection("127.0.0.1", port)
-        status, _, _ = await get(stream, "/healthz")
+        status, _, body = await get(stream, "/healthz")
         stream[1].close()
-        assert status == 200
+        assert status == 200, body
         seconds.append(time.perf_counter() - start)
         await asyncio.sleep(ASK_S)
     return seconds
+
+
+def begun(port):
+    """Whether the service has reported to the process of /healthz, which may be later than its first shard."""
+    with contextlib.suppress(OSError), urlopen(f"http://127.0.0.1:{port}/healthz") as answer:
+        return answer.status == 200
+    return False
 
 
 def probing(port, seconds):
@@ -110,6 +119,7 @@ def main(seconds, readers, file):
         service = start_module("ballistic_service", *options, stderr=subprocess.DEVNULL)
         try:
             wait_until(lambda: Path(folder, "data/manifest.json").exists() and Manifest.load(f"{folder}/data").revision)
+            wait_until(lambda: begun(health_port))
             command = [sys.executable, __file__, "probe", str(health_port), str(seconds)]
             environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (TESTS.parent, TESTS)))}
             asking = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
