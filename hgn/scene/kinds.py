@@ -27,7 +27,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "drop": (0.016, 0.2),
     },
     "stack": {"bodies": (2, 4), "size": (0.06, 0.12), "shift": (-0.03, 0.03)},
-    "apart": {"bodies": (2, 4), "size": (0.05, 0.12), "speed": (0.01, 0.4), "tilt": (0.0, 0.1)},
+    "apart": {"bodies": (2, 4), "size": (0.05, 0.12), "speed": (0.01, 2.0), "tilt": (0.0, 0.1)},
     "bowl": {"bowl": (0.25, 0.5), "size": (0.06, 0.14), "height": (0.05, 0.4)},
     "channel": {"width": (0.16, 0.36), "plate": (0.3, 0.5), "length": (0.08, 0.2), "height": (0.1, 0.3)},
     "stairs": {"steps": (3, 4), "plate": (0.2, 0.3), "rise": (0.06, 0.11), "size": (0.08, 0.14)},
