@@ -16,7 +16,15 @@ from scipy.sparse.csgraph import connected_components
 
 from hgn.config import MESH_SUFFIXES, USD_ENDINGS, is_mesh_file
 from hgn.scene.glb import read_glb
-from hgn.scene.polygons import concave_cut, fans, fans_by_size, polygons_of_obj, polygons_of_ply, refuse_utf_16
+from hgn.scene.polygons import (
+    concave_cut,
+    fans,
+    fans_by_size,
+    number_words,
+    polygons_of_obj,
+    polygons_of_ply,
+    refuse_utf_16,
+)
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
@@ -154,7 +162,7 @@ def _corners_of_stl(data: bytes) -> np.ndarray:
         raise ValueError("it ends before endsolid")
     if part := _PART_OF_FACET.search(_FACET.sub(b"\n", text)):
         raise ValueError(f"it has a facet that is not whole: {part[0].decode('utf-8', 'replace').strip()[:80]}")
-    return np.array(b" ".join(_FACET.findall(text)).lower().replace(b"vertex", b"").split(), np.float64)
+    return np.array(number_words(b" ".join(_FACET.findall(text)).lower().replace(b"vertex", b"")), np.float64)
 
 
 def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

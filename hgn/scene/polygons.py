@@ -40,6 +40,15 @@ def refuse_utf_16(data: bytes) -> None:
         raise ValueError("it is UTF-16 text; save it as UTF-8")
 
 
+def number_words(text: bytes) -> list[bytes]:
+    """Returns the words of text that has only numbers. Raises: ValueError for 1_0, which Python reads as 10."""
+    words = text.split()
+    if b"_" in text:
+        word = next(word for word in words if b"_" in word).decode("utf-8", "replace")
+        raise ValueError(f"it has {word[:80]} for a number; write it without _")
+    return words
+
+
 def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices, float64 [V, 3], and the vertices of each face of an OBJ file.
 
@@ -54,7 +63,7 @@ def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     vertices: list[list[bytes]] = []
     faces = []
     for keyword, line in _LINE.findall(text):
-        words = line.split()
+        words = number_words(line)
         if keyword in b"vV":
             vertices.append(words[:3])
         elif len(words) > 2:
@@ -77,7 +86,7 @@ def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         if words[0] == "format":
             form = words[1]
         elif words[0] == "element":
-            elements.append((words[1], int(words[2]), []))
+            elements.append((words[1], int(*number_words(words[2].encode())), []))
         elif words[0] == "property":
             elements[-1][2].append(words[1:])
     numbers = _Numbers(data[end.end() :], "" if form == "ascii" else "<>"["big" in form])
@@ -103,7 +112,7 @@ class _Numbers:
 
     def __init__(self, data: bytes, order: str) -> None:
         self.order, self.place = order, 0
-        self.bytes, self.words = data, np.zeros(0) if order else np.array(data.split(), np.float64)
+        self.bytes, self.words = data, np.zeros(0) if order else np.array(number_words(data), np.float64)
 
     def columns(self, count: int, properties: list[list[str]]) -> list[Any]:
         """Returns the next rows of these properties as columns. A column of lists contains arrays."""

@@ -1,7 +1,7 @@
 """Reads YAML and JSON files that people write. It is strict, because much of YAML 1.1 is unexpected.
 
-In YAML 1.1 a repeated key would replace the first one, 010 would be eight, and 1:30 ninety. This module refuses all of
-these and names the key and the line.
+In YAML 1.1 a repeated key would replace the first one, 010 would be eight, 1:30 ninety, and 1_0 ten. This module
+refuses all of these and names the key and the line.
 """
 
 import itertools
@@ -31,7 +31,8 @@ def read_yaml(path: Path) -> Any:
     """Returns the content of a YAML file as plain containers.
 
     Raises ConfigError, one line that starts with the path, for: a file that cannot be read, more than MAXIMUM_BYTES, a
-    repeated key, octal, sexagesimal or very long numbers, and aliases that expand to more than MAXIMUM_NODES values.
+    repeated key, numbers that are octal, sexagesimal, very long or have _, and aliases that expand to more than
+    MAXIMUM_NODES values.
     """
     rule, size = f"a YAML file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
     require(size <= MAXIMUM_BYTES, str(path), rule, size, "particles belong in .npz files")
@@ -115,6 +116,8 @@ def _check(node: yaml.Node, name: str, visited: set[int], loader: _Loader) -> No
         if _SEXAGESIMAL.fullmatch(node.value):
             remedy = "write it in decimals, or in quotes"
             raise ValueError(f"line {line}: {name}: {node.value[:40]} is a number of base 60 in YAML; {remedy}")
+        if "_" in node.value:
+            raise ValueError(f"line {line}: {name}: {node.value[:40]} is a number with _; write it without")
 
 
 _Loader.add_implicit_resolver(

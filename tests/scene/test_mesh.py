@@ -158,6 +158,14 @@ REFUSED = [
     ("a.ply", PLY.replace(b"face 1", b"face 2").replace(b"0 1 2", b"0 1 2\n4 0 1 2 1.5"), {}, "it has 1.5 where its"),
     ("a.ply", PLY.replace(b"face 1", b"tristrips 1"), {}, "it contains tristrips, which are not read"),
     ("a.ply", PLY.replace(b"uchar int", b"uchar float"), {}, "by numbers that are not whole"),
+    *(
+        (name, text.replace(b"1", b"0_1", count), {}, "it has 0_1.* for a number; write it without _")
+        for name, text, count in (
+            *(("a.obj", GOOD, 1), ("a.obj", TRIANGLE.encode() + FACE.replace(b"1", b"0_1"), 0)),
+            *(("a.ply", PLY.replace(b"face 1", b"face 0_1"), 0), ("a.ply", PLY.replace(b"0 1 2", b"0 0_1 2"), 0)),
+            ("a.stl", b"\n".join([b"solid", *FACETS, b"endsolid"]).replace(b"x 1", b"x 0_1"), 0),
+        )
+    ),
     ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*nan"),
     ("a.obj", b"v 0 0 inf\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*inf"),
     ("a.obj", b"v 0 0 1e39\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must stay within .*lower scale"),

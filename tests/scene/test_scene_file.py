@@ -204,6 +204,10 @@ MISTAKES = [
     (ONE_CUBE + "gravity:\n- 0\n- -9:30\n- 0\n", "line 5: gravity: -9:30 is a number of base 60 in YAML"),
     (ONE_CUBE + "cell_size: 1:0.5\n", "line 3: cell_size: 1:0.5 is a number of base 60"),
     (ONE_CUBE.replace("0.8", "1:48"), "line 2: position: 1:48 is a number of base 60"),
+    *(
+        (ONE_CUBE + f"seed: {word}\n", f"line 3: seed: {word} is a number with _; write it without")
+        for word in ("1_0", "0x1_0", "1_0.5")
+    ),
     (ONE_CUBE.replace("0.05", "0.05, 0.1, 0.2"), r"groups\[0\]\.0\.1 is not a known key; a list needs brackets"),
     (None, "the file must be a mapping"),
     ({}, "groups must be a list with at least one group, or emitters"),
