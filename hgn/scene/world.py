@@ -268,7 +268,7 @@ def _stack(new: Layout) -> None:
 
 
 def _apart(new: Layout) -> None:
-    """Places bodies on the floor without contact. Some slide, most slowly. In 30 % of the scenes tilted gravity moves all."""
+    """Places bodies on the floor without contact. Some slide, most slowly. In 30 %, tilted gravity moves all."""
     new.take_domain("room", "hall", "long")
     for _ in range(new.count("bodies")):
         size, velocity = new("size"), (0.0, 0.0, 0.0)
