@@ -66,13 +66,17 @@ class WeightsInfo:
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
     """Writes the file atomically. Structure and constraints are the network's own, not those in `info`.
 
-    With fp16 the parameters are rounded. The normaliser is not rounded.
+    With fp16 the parameters are rounded. The normaliser is not rounded. Raises: ConfigError if a number is not finite.
     """
     info = replace(info, network=network.config, step=network.step)
     tensors = {}
     for name, tensor in network.state_dict().items():
         rounded = stored_precision == "fp16" and not name.startswith("normaliser.")
-        tensors[name] = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
+        stored = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
+        wrong = stored[~stored.isfinite()][:1].tolist()
+        rule = f"finite in {'fp16' if rounded else 'fp32'}"
+        require(not wrong, f"weights tensor {name}", rule, sum(wrong))
+        tensors[name] = stored
     payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
     make_folder(path.parent)
     write_atomically(path, payload)

@@ -75,3 +75,15 @@ def test_a_name_is_needed():
     """An empty name is no file to write."""
     with pytest.raises(ConfigError, match="out must be a file name, got ''"):
         AverageConfig(("a.safetensors",) * 2, "")
+
+
+@pytest.mark.parametrize(
+    ("by", "coefficients", "stored"), [(0.1, (1e39, -1e39, 1.0), "fp32"), (1e6, (0.5, 0.5, 0.0), "fp16")]
+)
+def test_sums_out_of_range_are_refused(tmp_path, by, coefficients, stored):
+    """Terms or a mean beyond the largest number of the file's precision are named; nothing is written."""
+    files = tuple(str(moved(tmp_path / f"{name}.safetensors", by)) for name in "abc")
+    out = tmp_path / "mean.safetensors"
+    with pytest.raises(ConfigError, match=rf"weights tensor .* must be finite in {stored}, got (inf|-inf|nan)"):
+        average(AverageConfig(files, str(out), coefficients, stored))
+    assert not out.exists()
