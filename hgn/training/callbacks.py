@@ -39,7 +39,7 @@ from hgn.training.schedule import log_line_due, measurement_due
 from hgn.training.stop import BY_WEIGHT, StopRequest
 
 METRICS = "metrics.jsonl"
-ESTIMATE_AFTER_S = 10.0  # duration of the updates from which the remaining time is estimated
+ESTIMATE_AFTER_S = 10.0  # duration of the updates from which the remaining time is estimated, and its least value
 
 
 class SameWeights(Callback):
@@ -202,10 +202,10 @@ class LogLines(Callback):
         now, update = time.monotonic(), module.update
         self._first = self._first or (now, update)  # not timed, because it compiles kernels
         seconds, updates = now - self._first[0], update - self._first[1]
-        if self._estimated or self.feed.interrupted() or updates < 2 or seconds < ESTIMATE_AFTER_S:
+        left_s = (self.feed.training.maximum_updates - update) * seconds / max(1, updates)
+        if self._estimated or self.feed.interrupted() or updates < 2 or min(seconds, left_s) < ESTIMATE_AFTER_S:
             return
         self._estimated = True
-        left_s = (self.feed.training.maximum_updates - update) * seconds / updates
         text = f"about {duration(left_s)} for the other updates, at {updates / seconds:.2g} a second"
         if module.device.type == "cpu" and left_s > LONG_ON_A_CPU_S:
             text += f"; {WAY_OUT}"

@@ -98,7 +98,7 @@ def wait_for_episodes(
             f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
             f"out={folder}, or set training.generate=true"
         )
-    progress, started, seen_s = None, time.monotonic(), -math.inf
+    progress, seen_s = None, -math.inf
     while not stop.requested:
         try:
             store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
@@ -113,7 +113,7 @@ def wait_for_episodes(
                 progress.close()
                 frames = 0 if generator is None else generator.frames_done()
                 if frames:
-                    print(estimate(config, frames, time.monotonic() - started), file=sys.stderr)
+                    print(estimate(config, frames, progress.format_dict["elapsed"]), file=sys.stderr)
             return PooledStore(store, others) if others else store
         if generator is not None:
             generator.check()

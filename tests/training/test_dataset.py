@@ -1,5 +1,7 @@
 """The data set of a training: what its scenes take, what is missing, progress, and several data sets."""
 
+from unittest import mock
+
 import pytest
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
@@ -63,6 +65,18 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [3]
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
     assert "for the other updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
+
+
+@pytest.mark.parametrize(("update", "printed"), [(5, True), (11, False)])
+def test_times_of_seconds_are_not_estimated(tmp_path, monkeypatch, update, printed):
+    """After 100 seconds of 12 updates, 7 left take 140 seconds, which is said, and 1 left 9 seconds, which is not."""
+    feed, progress = mock.Mock(training=mock.Mock(maximum_updates=12)), mock.Mock()
+    feed.interrupted.return_value = False
+    lines = callbacks.LogLines(tmp_path, {}, feed, str)
+    lines._first = (0.0, 0)
+    monkeypatch.setattr("hgn.training.callbacks.time.monotonic", lambda: 100.0)
+    lines._estimate(mock.Mock(update=update), progress)
+    assert progress.write.called == printed
 
 
 def test_long_data_sets_are_announced_before_they_are_made(make_config, tmp_path, monkeypatch, capsys):

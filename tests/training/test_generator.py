@@ -1,6 +1,5 @@
 """The generator that a training starts itself: a process of its own, that makes what is missing."""
 
-import signal
 import time
 from dataclasses import replace
 from unittest import mock
@@ -67,26 +66,31 @@ def test_makes_what_is_missing(tmp_path):
         other.check()
 
 
-def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch):
-    """The bar counts the frames of validation scenes that are made before the last training scene needed. The time
-    until the first frame is left out of its rate."""
+def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch, capsys):
+    """The bar counts the frames of validation scenes that are made before the last training scene needed. Its rate
+    and the estimate leave out the time until the first frame, in which processes start and kernels are compiled."""
     dataset = DatasetConfig(folder=str(tmp_path), training_scenes=4, validation_scenes=5, frames=40)
     config = TrainConfig(dataset=dataset, training=TrainingConfig(minimum_episodes=2))
-    bars, stop = [], StopRequest()
+    bars, stop, store = [], StopRequest(), mock.MagicMock()
     monkeypatch.setattr(
         "hgn.training.dataset.bar", lambda *given, **named: bars.append(bar(*given, **named)) or bars[0]
     )
 
     def pass_time(_):
-        seconds, stop.signal = next(looks)
+        seconds = next(looks)
         bars[0]._time = lambda: start_s + seconds
 
-    looks = iter(((60.0, None), (65.0, signal.SIGTERM)))
+    looks = iter((60.0, 65.0))
     start_s = time.time()
     monkeypatch.setattr("hgn.training.dataset.time.sleep", pass_time)
-    generator = mock.Mock(running=True, frames_done=mock.Mock(side_effect=(0, 1)))
-    assert wait_for_episodes(config, generator, stop) is None
+    generator = mock.Mock(running=True, frames_done=mock.Mock(side_effect=(0, 1, 3)))
+    store.available.side_effect = (False, False, True)
+    store.return_value.__len__.return_value = 2
+    monkeypatch.setattr("hgn.training.dataset.EpisodeStore", store)
+    monkeypatch.setattr("hgn.training.dataset.estimate", lambda *given: given)
+    assert wait_for_episodes(config, generator, stop) is store.return_value
     (progress,) = bars
+    assert str((config, 3, 5.0)) in capsys.readouterr().err
     assert progress.total == 3 * 40 and progress.n == 1
     assert progress.format_dict["elapsed"] == pytest.approx(5.0)
     progress.close()
