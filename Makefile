@@ -41,7 +41,7 @@ demo: $(VENV)/.demo
 	$(RUN) -m hgn.train +experiment=demo
 	@echo "== 2 of 4: exporting inference weights"
 	$(RUN) -m hgn.export checkpoint=$(DEMO)/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
-	@echo "== 3 of 4: simulating a validation scene beside its ground truth"
+	@echo "== 3 of 4: simulating a validation scene, and drawing it with its ground truth"
 	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 frames=40 out=$(DEMO)/rollout.vtkhdf
 	$(RUN) -m tools.render rollout=$(DEMO)/rollout.vtkhdf out=$(DEMO)/pictures every=2
 	@echo "== 4 of 4: errors"
@@ -49,8 +49,8 @@ demo: $(VENV)/.demo
 	@echo "weights: $(DEMO)/weights.safetensors"
 	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"
 	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif: a scene that the network was not"
-	@echo "trained on; above or left its prediction, below or right the solver: bodies meet on the obstacle alike;"
-	@echo "on the floor the water of so small a network spreads less evenly than the solver's."
+	@echo "trained on. Its prediction is above (PNG) or on the left (GIF). In both, the bodies meet on the obstacle. On the"
+	@echo "floor, the water of this small network spreads less evenly than the solver's."
 
 test: setup
 	@echo "about 7 minutes on two free cores; at the end: which tests were skipped, and why (no GPU, no namespaces, ...)"

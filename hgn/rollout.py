@@ -60,9 +60,7 @@ class RolloutConfig(SimulatorConfig):
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
     out: str | None = None
     surface: bool = False  # also write water as a closed surface, in USD and PLY
-    render: bool | None = (
-        None  # also draw a PNG and a GIF in the folder of the file; null: yes without out, no with out
-    )
+    render: bool | None = None  # also draw a PNG and a GIF next to the file; null: yes without out, no with out
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene, or an episode
     scene: str | None = None
     # seed of a random scene, drawn as the training scenes; null: 13, where all materials fall on obstacles

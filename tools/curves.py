@@ -175,7 +175,8 @@ def _draw_several(panels: Any, runs: Sequence[Run], last: Mapping[str, float]) -
     for panel, label in zip(panels, ("scenes trained on", "scenes trained on", "minutes of training"), strict=True):
         panel.set_xlabel(label)
         first, last_one = panel.dataLim.intervalx
-        panel.set_xscale("log" if last_one > 10 * first else "linear")  # less than a decade has long labels in between
+        # an axis of less than two decades has long labels in between
+        panel.set_xscale("log" if last_one > 100 * first else "linear")
     for panel in panels[1:]:
         _plot_baselines(panel, last)
         panel.set_ylabel(ONE_STEP + ", validation")

@@ -39,7 +39,7 @@ class RenderConfig:
     surface: bool = False  # true: USD and PLY also contain water as a closed surface
     # file of python -m hgn.rollout; or the name of a scene in conf/gallery, which the solver simulates
     rollout: str | None = None
-    # further rollouts of the same scene, drawn next to it; of a scene in conf/gallery: weights
+    # further rollouts of the same scene, drawn next to it for its number of frames; of a scene in conf/gallery: weights
     others: tuple[str, ...] = ()
     # labels of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
     names: tuple[str, ...] | None = None

@@ -30,10 +30,14 @@ def duration(seconds: float) -> str:
 
 
 def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqdm[Any]:
-    """Returns a tqdm bar on stderr. Without a terminal it prints at most a line every 15 seconds."""
+    """Returns a tqdm bar on stderr. Without a terminal it prints at most a line every 15 seconds.
+
+    Without a total the bar is invisible until its first item.
+    """
     style: dict[str, Any] = {"file": sys.stderr, "mininterval": 0.5, "maxinterval": 10.0, "dynamic_ncols": True}
     if not sys.stderr.isatty():
         style = {"file": _Lines(), "mininterval": LINE_INTERVAL_S, "maxinterval": LINE_INTERVAL_S, "ncols": 110}
+    style["delay"] = 0.001 if total is None else 0
     return tqdm(total=total, initial=initial, unit=f" {unit}", desc=what, miniters=1, **style)
 
 

@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
-from lightning.pytorch.loggers.logger import Logger
+from lightning.fabric.loggers import Logger, TensorBoardLogger  # Lightning's other one writes an empty hparams.yaml
+from lightning.pytorch.loggers import Logger as TrainerLogger
+from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
 
 from hgn.schema import printable
 from hgn.system.files import write_atomically
@@ -71,7 +72,7 @@ def build_loggers(kinds: Iterable[str], run: Path, settings: dict[str, Any]) -> 
     return [ThreadedLogger(kind, run, settings) for kind in dict.fromkeys(kinds)] if first_rank() else []
 
 
-class ThreadedLogger(Logger):
+class ThreadedLogger(TrainerLogger):
     """Calls one of Lightning's loggers in a thread, which starts with the first call. Its first fault is printed."""
 
     def __init__(self, kind: str, run: Path, settings: dict[str, Any]) -> None:

@@ -370,8 +370,7 @@ class PlayPage:
             raise ConfigError("there is no room for a ball here")
 
     def _limit(self) -> str:
-        most = self.session.maximum_particles
-        return f"no more than {most:,} particles, to stay fast; Undo takes some away, hgn.play particles=N allows more"
+        return f"no more than {self.session.maximum_particles:,} particles, to stay fast; particles=N allows more"
 
     def _spout(self, origin_3: np.ndarray, direction_3: np.ndarray) -> Spout:
         """Returns a spout above the point where a ray meets the floor or leaves through a wall.

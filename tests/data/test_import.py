@@ -159,6 +159,13 @@ def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
     assert "train.npz: \\x1b[31m to y = -0.25" in capsys.readouterr().err
 
 
+def test_a_folder_without_trajectories(tmp_path, capsys):
+    """The error is the only line: no progress of an import that has not begun."""
+    with pytest.raises(ConfigError, match="from must be a folder with train"):
+        import_trajectories.main(options(tmp_path / "out", tmp_path))
+    assert not capsys.readouterr().err
+
+
 def flights(*gravities):
     time_T11 = np.arange(20)[:, None, None] / 60
     start = np.random.default_rng(1).uniform(0.4, 0.6, (10, 3))

@@ -56,13 +56,13 @@ def test_several_runs(tmp_path):
 
 
 def test_short_runs(tmp_path, monkeypatch):
-    """The files of a run are in its folder by default. An axis of less than a decade is linear, because the labels
-    between two powers of ten overlap."""
+    """The files of a run are in its folder by default. An axis of less than two decades is linear, because the
+    labels between two powers of ten overlap."""
     assert main({"runs": [str(make_run(tmp_path / "x"))]}) == 0
     assert {path.name for path in (tmp_path / "x").glob("curves.*")} == {"curves.png", "curves.json"}
     figures = []
     monkeypatch.setattr("tools.report.as_png", lambda figure: figures.append(figure) or b"")
-    draw([read_run(make_run(tmp_path / name)) for name in ("y", "z")])
+    draw([read_run(make_run(tmp_path / name, updates=120)) for name in ("y", "z")])
     assert [panel.get_xscale() for panel in figures[0].axes] == ["log", "linear", "linear"]
 
 

@@ -126,7 +126,8 @@ def test_a_drag_that_reaches_the_limit_is_told_once(page, messages, monkeypatch)
     page._end_pouring()
     for _ in range(5):  # the mouse moves on
         sent(page, lambda: page._pour(*ray))
-    assert page.session.spout is None and len(steps) == len(messages) == 1 and "Undo takes some away" in messages[0]
+    assert page.session.spout is None and len(steps) == len(messages) == 1 and "particles=N allows more" in messages[0]
+    assert "Undo" not in messages[0]  # it takes nothing away if the scene itself is at the limit
     sent(page, lambda: page._pour(ray[0], None))  # the mouse is released, pressed again, and moves
     for _ in range(5):
         sent(page, lambda: page._pour(*ray))
