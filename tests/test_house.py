@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_133,
+    "hgn": 34_144,
     "datagen": 8_991,
     "tools": 6_349,
-    "tests": 34_524,
+    "tests": 34_531,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hgn.scene.scene import Obstacle, all_corners
-from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
+from hgn.scene.surface import MAXIMUM_SAMPLES, area_vectors, sample_surface, split_long_edges
 from hgn.schema import ConfigError, Vector, require
 
 CANCELLED = 0.25  # length of a cell's mean normal below which its normals cancel; three faces of a corner give 0.58
@@ -79,12 +79,16 @@ def grid_of_samples(
 
 
 def surface_samples(
-    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None = None
+    obstacles: Sequence[Obstacle],
+    cell_size: float,
+    seed: int,
+    domain_size: Vector | None = None,
+    most: int = MAXIMUM_SAMPLES,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the samples of `build_obstacle_grid`, float64 [S, 3], and unit normals and friction of their triangles.
 
     They can be moved with an obstacle to compute its cells elsewhere without sampling it again.
-    Raises: ConfigError as `build_obstacle_grid`.
+    Raises: ConfigError as `build_obstacle_grid`, here for `most` samples or more.
     """
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     sizes = np.array([len(obstacle.triangle_F3) for obstacle in obstacles], np.int64)
@@ -97,7 +101,7 @@ def surface_samples(
         corner_F34 = split_long_edges(corner_F34, SPLIT_CELLS * cell_size, unbounded)
     corner_F33 = np.ascontiguousarray(corner_F34[..., :3])
     rng = np.random.Generator(np.random.PCG64(seed))
-    point_S3, owner_S = sample_surface(corner_F33, NORMAL_SPACING_CELLS * cell_size, rng)
+    point_S3, owner_S = sample_surface(corner_F33, NORMAL_SPACING_CELLS * cell_size, rng, most)
     if domain_size is not None:
         near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
         point_S3, owner_S = point_S3[near], owner_S[near]

@@ -22,13 +22,15 @@ MAXIMUM_SAMPLES, MAXIMUM_PIECES = 3_000_000, 2_000_000  # samples take about 6 C
 MOST_PAIRS = 5e6  # about the largest number of near pairs in memory; surfaces may lie on one another
 
 
-def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sample_surface(
+    corner_F33: np.ndarray, spacing: float, rng: np.random.Generator, most: int = MAXIMUM_SAMPLES
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns random points of triangles, no two closer than `spacing` (Paper sec. 3: Poisson disks).
 
     Returns float64 [S, 3] and the triangle of each point, int64 [S]. Candidates are drawn by area; slivers thinner than
     about the spacing are drawn by length. A candidate is accepted unless it is too close to an earlier point. Rounds
     end when few are added. Zero-area triangles get no points. The state of `rng` determines the result.
-    Raises: ConfigError if the surface is too large for the spacing.
+    Raises: ConfigError if the surface needs `most` samples or more.
     """
     weight = _weights(corner_F33, spacing)
     usable = np.flatnonzero(weight > 0)
@@ -36,9 +38,9 @@ def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Genera
     if len(usable) == 0:
         return np.zeros((0, 3)), np.zeros(0, np.int64)
     expected = CANDIDATES * running[-1] / (spacing * spacing)
-    if not expected < MAXIMUM_SAMPLES:
+    if not expected < most:
         raise ConfigError(
-            f"obstacle surface must need fewer than {MAXIMUM_SAMPLES} samples at spacing {spacing:g}, got "
+            f"obstacle surface must need fewer than {most} samples at spacing {spacing:g}, got "
             f"{expected:.3g}; scale the mesh down, cut away what lies outside the domain, or raise cell_size"
         )
     candidate_count = int(expected) + MINIMUM_CANDIDATES

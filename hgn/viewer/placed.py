@@ -23,6 +23,7 @@ from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
+from hgn.scene.surface import MAXIMUM_SAMPLES
 from hgn.schema import Vector
 
 JUMP = 0.1  # longest displacement of an obstacle in a frame that moves particles along, domain units
@@ -38,12 +39,13 @@ class Body:
     mesh: Obstacle
     cell_size: float
     mesh_file: bytes | None = None
+    most_samples: int = MAXIMUM_SAMPLES
     number: int = field(default_factory=lambda: next(_numbers))
 
     @cached_property
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns points on the surface and their normals, float64 [S, 3]."""
-        return surface_samples((self.mesh,), self.cell_size, seed=0)[:2]
+        return surface_samples((self.mesh,), self.cell_size, seed=0, most=self.most_samples)[:2]
 
     @property
     def name(self) -> str:
@@ -94,16 +96,18 @@ def plain(name: str) -> str:
     return re.sub("[^A-Za-z0-9_.-]+", "_", name)[:LONGEST_STEM]
 
 
-def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObstacle:
+def placed_by(
+    entry: ObstacleEntry, folder: Path, cell_size: float, most_samples: int = MAXIMUM_SAMPLES
+) -> PlacedObstacle:
     """Returns the obstacle of an entry. Raises ConfigError for a mesh that is unreadable or too large to sample."""
     if entry.mesh is not None:
         path = folder / entry.mesh
         mesh = load_mesh(path, scale=1.0 if entry.scale is None else entry.scale)
-        body = Body(entry, dataclasses.replace(mesh, friction=entry.friction), cell_size, path.read_bytes())
+        mesh_file = path.read_bytes()
     else:
         assert entry.shape is not None and entry.size is not None
-        mesh = shape_obstacle(entry.shape, entry.size)
-        body = Body(entry, dataclasses.replace(mesh, friction=entry.friction), cell_size)
+        mesh, mesh_file = shape_obstacle(entry.shape, entry.size), None
+    body = Body(entry, dataclasses.replace(mesh, friction=entry.friction), cell_size, mesh_file, most_samples)
     placed = PlacedObstacle(body, entry.position or (0.0, 0.0, 0.0), entry.rotation)
     _ = placed.samples
     return placed

@@ -31,6 +31,7 @@ from hgn.viewer.recording import Frame, Recording
 CLEARANCE = 1.25  # least distance of an entering particle from all others, in spacings of particles at rest
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
 MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of files, including those of obstacles in past frames
+MOST_SAMPLES = 600_000  # surface samples of an added mesh: about 4 CPU seconds, in which the page stands still
 CHANGES = 100  # largest number of changes that can be undone
 FULL_SHARE = 0.5  # the spout waits while more than this fraction of the particles of one frame are still near it
 
@@ -249,7 +250,7 @@ class PlaySession:
         """Adds an obstacle of a shape, or of a mesh file in a folder. Raises ConfigError as a scene file does."""
         rule, count = f"at most {MAXIMUM_OBSTACLES}", len(self.obstacles) + 1
         require(count <= MAXIMUM_OBSTACLES, "obstacles", rule, count, "remove one")
-        placed = placed_by(entry, folder, self.cell_size)
+        placed = placed_by(entry, folder, self.cell_size, MOST_SAMPLES)
         size = sum(len(body.mesh_file or b"") for body in {*self._bodies, placed.body})
         require(size <= MAXIMUM_MESH_BYTES, "mesh files", f"at most {MAXIMUM_MESH_BYTES} bytes", size, "restart")
         self._bodies.add(placed.body)

@@ -84,6 +84,12 @@ def moved(**place):
     return lambda page: page.session.move_obstacle(replace(page.session.obstacles[0], **place))
 
 
+def sheets(count):
+    """Squares above one another, which need the samples of as many surfaces."""
+    corners = "".join(f"v 0 {i} 0\nv {count} {i} 0\nv {count} {i} {count}\nv 0 {i} {count}\n" for i in range(count))
+    return (corners + "".join(f"f {4 * i + 1} {4 * i + 2} {4 * i + 3} {4 * i + 4}\n" for i in range(count))).encode()
+
+
 INFINITE, NAN, LISTED = float("inf"), float("nan"), "weights must be one of floating, other"
 REFUSED = [
     (file("x\0y.obj", TRIANGLES), "null"),
@@ -91,6 +97,7 @@ REFUSED = [
     (file("x.glb", b"glTF\x02\0\0\0" + bytes(8)), "x.glb"),
     (file("x.stl", b""), "x.stl"),
     (file("x.txt", TRIANGLES), "mesh must be one of"),
+    (file("x.obj", sheets(700)), "fewer than 600000 samples"),
     (file("x.obj", bytes(MAXIMUM_UPLOAD_BYTES + 1)), "at most 64 MiB"),
     *((click(*ray), "ray") for ray in ((0.0, 0.0, 0.0), (NAN, 0.0, 1.0), (INFINITE, 0.0, 0.0))),
     *((gravity(*value), "gravity") for value in ((NAN, 0.0, 0.0), (0.0, INFINITE, 0.0), (0.0, 1e30, 0.0))),
