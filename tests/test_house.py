@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 34_144,
     "datagen": 8_991,
-    "tools": 6_349,
+    "tools": 6_352,
     "tests": 34_531,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config

@@ -28,7 +28,10 @@ FEWER = {
     "training.maximum_updates=5000": "training.maximum_updates=20",
 }
 OPEN = "make setup\n.venv/bin/pip install jupyterlab\n.venv/bin/jupyter lab docs/notebooks"
-FIRST = f"This notebook is the page docs/{{page}}. To open it, in the folder of the project:\n```bash\n{OPEN}\n```"
+FIRST = (
+    "This notebook is the page docs/{page}. It writes its files to a new temporary folder, and does not delete them. "
+    f"To open it, in the folder of the project:\n```bash\n{OPEN}\n```"
+)
 BEGIN = "import os\nimport sys\nimport tempfile\n\nos.chdir(tempfile.mkdtemp())  # for the files of this notebook"
 SHOW = {"own_data": "from IPython.display import Image\n\nImage('mine.png')"}
 _BLOCK = re.compile(r"(?:<!-- file: (\S+) -->\n)?```(\w+)\n(.*?)```\n", re.DOTALL)
