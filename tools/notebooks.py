@@ -34,6 +34,8 @@ FIRST = (
 )
 BEGIN = "import os\nimport sys\nimport tempfile\n\nos.chdir(tempfile.mkdtemp())  # for the files of this notebook"
 SHOW = {"own_data": "from IPython.display import Image\n\nImage('mine.png')"}
+RAISING = ["--InteractiveShell.system_raise_on_error=True"]  # a cell ends with an error where its command fails
+SHOWN_LINES = 20  # number of last lines of each cell's output that an error shows
 _BLOCK = re.compile(r"(?:<!-- file: (\S+) -->\n)?```(\w+)\n(.*?)```\n", re.DOTALL)
 
 
@@ -43,6 +45,7 @@ def main() -> int:
         print(__doc__.strip())
         return 0
     from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError
     from nbformat import from_dict
 
     (DOCS / "notebooks").mkdir(exist_ok=True)
@@ -54,7 +57,14 @@ def main() -> int:
                 cell.update(stored | {"id": cell["id"]})
         else:
             with tempfile.TemporaryDirectory() as folder:
-                NotebookClient(content, timeout=None, resources={"metadata": {"path": folder}}).execute()
+                place = {"metadata": {"path": folder}}
+                try:
+                    NotebookClient(content, timeout=None, extra_arguments=RAISING, resources=place).execute()
+                except CellExecutionError as error:
+                    for cell in _code(content):
+                        if text := _printed(cell):
+                            error.add_note("\n".join([cell.source, *text.splitlines()[-SHOWN_LINES:]]))
+                    raise
             for cell in content.cells:
                 _tidy(cell)
         write_atomically(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
@@ -65,16 +75,21 @@ def _code(content: Any) -> list[Any]:
     return [cell for cell in content["cells"] if cell["cell_type"] == "code"]
 
 
-def _tidy(cell: Any) -> None:
-    """Joins what a cell prints, keeps only the end of a progress bar and one form of a picture."""
-    cell.metadata.clear()
+def _printed(cell: Any) -> str:
+    """Joins what a cell prints, and keeps only the end of a progress bar."""
     printed = "".join(output.get("text", "") for output in cell.get("outputs", ()))
-    text = without_folders(re.sub(r"[^\n]*\r(?!\n)", "", printed.replace("\r\n", "\n")))
-    shown = [output for output in cell.get("outputs", ()) if "text" not in output]
+    return without_folders(re.sub(r"[^\n]*\r(?!\n)", "", printed.replace("\r\n", "\n")))
+
+
+def _tidy(cell: Any) -> None:
+    """Keeps of a cell's outputs the text and one form of a picture."""
+    cell.metadata.clear()
+    text, outputs = _printed(cell), cell.get("outputs", ())
+    shown = [output for output in outputs if "text" not in output]
     for output in shown:
         output.data.pop("image/jpeg", None)
-    if printed or shown:
-        stream = [{"output_type": "stream", "name": "stdout", "text": text}] if printed else []
+    if outputs:
+        stream = [{"output_type": "stream", "name": "stdout", "text": text}] if text else []
         cell.outputs = [*stream, *shown]
 
 

@@ -6,6 +6,7 @@ import re
 import nbformat
 import pytest
 from docs.pages import run_module
+from nbclient.exceptions import CellExecutionError
 
 from tools import notebooks
 from tools.notebooks import DOCS, NOTEBOOKS, notebook
@@ -76,6 +77,22 @@ def test_notebooks_run(name, warm_python, tmp_path, monkeypatch):
     ended = nbformat.read(tmp_path / "notebooks" / f"{name}.ipynb", as_version=4)
     printed = [output.get("text", "") for cell in ended.cells for output in cell.get("outputs", ())]
     assert not any("error: " in text or "Traceback" in text for text in printed), printed
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_failing_command_ends_a_notebook(tmp_path, monkeypatch):
+    """A cell fails where its command fails; the error shows the ends of what this cell and those before it printed."""
+    commands = ("print(*range(40), sep=chr(10))", 'import sys; sys.exit(print("third") or 3)', "")
+    (tmp_path / "page.md").write_text("".join(f"```bash\npython -c '{command}'\n```\n" for command in commands))
+    monkeypatch.setattr(notebooks, "DOCS", tmp_path)
+    monkeypatch.setattr(notebooks, "NOTEBOOKS", {"failing": "page.md"})
+    monkeypatch.setattr("sys.argv", ["notebooks", "failing"])
+    with pytest.raises(CellExecutionError, match=r"CalledProcessError.*exit status 3") as error:
+        notebooks.main()
+    first, second = (note.splitlines()[1:] for note in error.value.__notes__)
+    assert first == [str(i) for i in range(20, 40)] and second == ["third"]
+    assert not list(tmp_path.rglob("*.ipynb"))
 
 
 def test_help(capsys):
