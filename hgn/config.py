@@ -395,7 +395,9 @@ class TrainingConfig:
     precision: PrecisionOrAuto = "auto"  # fp32, tf32 or fp16 products; auto: the fastest that passes its check
     # torch, or triton (kernels in CUDA graphs); auto: triton if it is supported
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
-    minimum_episodes: Positive[int] = 1  # number of published training episodes at which training starts
+    # number of published training episodes at which training starts; while its generator runs, it also waits for the
+    # first validation episode
+    minimum_episodes: Positive[int] = 1
     generate: bool = True  # whether to start the generator if the data set is missing or incomplete
     # loggers in addition to metrics.jsonl: tensorboard, wandb, mlflow; their variables name servers and projects
     loggers: tuple[Annotated[str, one_of(*LOGGERS)], ...] = ("tensorboard",)

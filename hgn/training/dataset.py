@@ -87,12 +87,17 @@ def wait_for_episodes(
 ) -> AnyStore | None:
     """Waits until enough training episodes are published, those of `others` included. Shows the progress.
 
+    While the generator runs, it also waits for the first validation episode: otherwise a short training might end
+    before one is published, without a best checkpoint.
     Returns None after a stop request. Once the manifest has been read, later reads may fail for the standard patience.
     Raises: ConfigError if the generator failed, or if no process generates the missing episodes.
     """
     folder = config.dataset.folder
     present = sum(map(len, others))
     needed = max(0, min(config.training.minimum_episodes, config.dataset.training_scenes + present) - present)
+    others_validate = any(store.manifest.published("validation") for store in others)
+    # number of validation episodes made before the start, because the generator alternates between the splits
+    validation = min(max(needed - 1, 0 if others_validate else 1), config.dataset.validation_scenes)
     if generator is None and first_rank() and not EpisodeStore.available(folder):
         raise ConfigError(
             f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
@@ -100,6 +105,8 @@ def wait_for_episodes(
         )
     progress, seen_s = None, -math.inf
     while not stop.requested:
+        # read before the manifest, which then has all episodes of a generator that has ended
+        running = generator is not None and generator.running
         try:
             store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
             seen_s = time.monotonic()
@@ -108,7 +115,8 @@ def wait_for_episodes(
                 raise
             time.sleep(0.5)
             continue
-        if store is not None and len(store) >= needed:
+        awaited = min(1, validation) if running else 0
+        if store is not None and len(store) >= needed and store.manifest.published("validation") >= awaited:
             if progress is not None:
                 progress.close()
                 frames = 0 if generator is None else generator.frames_done()
@@ -116,8 +124,8 @@ def wait_for_episodes(
                     print(estimate(config, frames, progress.format_dict["elapsed"]), file=sys.stderr)
             return PooledStore(store, others) if others else store
         if generator is not None:
-            generator.check()
-            if not generator.running:
+            if not running:
+                generator.check()
                 raise ConfigError(
                     f"training.minimum_episodes must be reachable, got {needed} where the data set has "
                     f"{len(store) if store else 0}; ask for more scenes"
@@ -128,8 +136,8 @@ def wait_for_episodes(
                 "generate them, or set training.generate=true"
             )
         if progress is None and first_rank():
-            print(printable(f"waiting for training episode {needed} in {folder}"), file=sys.stderr)
-            validation = max(0, min(needed - 1, config.dataset.validation_scenes))  # made before the last one needed
+            text = f"waiting for {needed} training and {awaited} validation episodes in {folder}"
+            print(printable(text), file=sys.stderr)
             progress = bar("generating", total=(needed + validation) * config.dataset.frames, unit="frame")
         if progress is not None and generator is not None:
             advance_to(progress, min(max(generator.frames_done(), progress.n), progress.total))

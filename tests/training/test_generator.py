@@ -86,6 +86,7 @@ def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch, ca
     generator = mock.Mock(running=True, frames_done=mock.Mock(side_effect=(0, 1, 3)))
     store.available.side_effect = (False, False, True)
     store.return_value.__len__.return_value = 2
+    store.return_value.manifest.published.return_value = 1
     monkeypatch.setattr("hgn.training.dataset.EpisodeStore", store)
     monkeypatch.setattr("hgn.training.dataset.estimate", lambda *given: given)
     assert wait_for_episodes(config, generator, stop) is store.return_value
@@ -94,3 +95,31 @@ def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch, ca
     assert progress.total == 3 * 40 and progress.n == 1
     assert progress.format_dict["elapsed"] == pytest.approx(5.0)
     progress.close()
+
+
+def test_waits_for_a_validation_scene(make_config, make_dataset, monkeypatch):
+    """While its generator runs, a training starts with a validation scene: a short one might end before there is one,
+    without best.ckpt. It starts without one if none is wanted or nothing makes one. A generator may make the last
+    scene and end just after a look."""
+    config, looks = make_config(validation_scenes=1, test_scenes=0), []
+    few = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
+    make_dataset(few)
+    ended, generator = mock.Mock(running=False), mock.Mock(running=True, frames_done=lambda: 0)
+
+    def validation_scenes(config, generator):
+        training = TrainConfig(scene=config.scene, dataset=config.dataset)
+        return len(wait_for_episodes(training, generator, StopRequest()).of_split("validation"))
+
+    def look(store, *given):
+        load(store, *given)
+        if not looks:
+            make_dataset(config)
+        looks.append(len(store))
+        generator.running = False
+
+    for wanted, maker in ((few, generator), (config, None), (config, ended)):
+        assert validation_scenes(wanted, maker) == 0
+    load = EpisodeStore.__init__
+    monkeypatch.setattr(EpisodeStore, "__init__", look)
+    monkeypatch.setattr("hgn.training.dataset.time.sleep", lambda _: None)
+    assert validation_scenes(config, generator) == 1 and looks == [1, 5]
