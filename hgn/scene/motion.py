@@ -6,7 +6,6 @@ Shape legend: T keyframes, P points, B boxes.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -82,13 +81,9 @@ class Motion:
         steps = TURN_STEPS if np.ptp(self.rotation_T33, axis=0).any() else 1
         before = np.maximum(np.arange(len(self.time_T)) - 1, 0)  # the first boxes are those of the first pose
         begin_T33, begin_T3 = self.rotation_T33[before], self.translation_T3[before]
-        turn_T3 = np.array([turning(turn_33) for turn_33 in self.rotation_T33 @ begin_T33.transpose(0, 2, 1)])
-        angle_T1 = np.linalg.norm(turn_T3, axis=1, keepdims=True)
-        cross_T133 = np.cross(np.eye(3), (turn_T3 / np.maximum(angle_T1, 1e-12))[:, None])[:, None]
+        turn_T3 = turning(self.rotation_T33 @ begin_T33.transpose(0, 2, 1))
         fraction_S11 = np.linspace(0, 1, steps + 1)[:, None, None]
-        angle_TS11 = angle_T1[:, None, None] * fraction_S11
-        # Rodrigues as in `turned`, for all times together: scenes may have 30,000 keyframes
-        turn_TS33 = np.eye(3) + np.sin(angle_TS11) * cross_T133 + (1 - np.cos(angle_TS11)) * cross_T133 @ cross_T133
+        turn_TS33 = turned((turn_T3[:, None] * fraction_S11[:, 0]).reshape(-1, 3)).reshape(len(before), -1, 3, 3)
         way_TS13 = begin_T3[:, None, None] + fraction_S11 * (self.translation_T3 - begin_T3)[:, None, None]
         rotation_TS33 = turn_TS33 @ begin_T33[:, None]
         place_TS83 = (corner_83 - self.pivot) @ rotation_TS33.swapaxes(2, 3) + self.pivot + way_TS13
@@ -108,31 +103,15 @@ class Motion:
 AT_REST = Motion.of_frames([(0.0, (0.0, 0.0, 0.0))], (0.0, 0.0, 0.0))
 
 
-def turning(rotation_33: np.ndarray) -> np.ndarray:
-    """Returns the axis of a rotation times its angle in radians, at most pi, float64 [3]."""
-    axis = np.array(
-        [
-            rotation_33[2, 1] - rotation_33[1, 2],
-            rotation_33[0, 2] - rotation_33[2, 0],
-            rotation_33[1, 0] - rotation_33[0, 1],
-        ]
-    )
-    sine, cosine = 0.5 * float(np.linalg.norm(axis)), 0.5 * (float(np.trace(rotation_33)) - 1)
-    angle = math.atan2(sine, cosine)
-    if sine > 1e-6:
-        return np.asarray(axis * (0.5 * angle / sine))
-    if cosine > 0:
-        return np.asarray(0.5 * axis)
-    # the angle is pi, so R + I is twice the projection on the axis
-    column = (rotation_33 + np.eye(3))[:, int(np.argmax(np.diag(rotation_33)))]
-    return np.asarray(angle * column / np.linalg.norm(column))
+def turning(rotation: np.ndarray) -> np.ndarray:
+    """Returns the axis of a rotation [..., 3, 3] times its angle in radians, at most pi, float64 [..., 3]."""
+    from scipy.spatial.transform import Rotation  # here, because it takes 0.1 s and few scenes have motions
+
+    return Rotation.from_matrix(rotation).as_rotvec()
 
 
 def turned(turn: np.ndarray) -> np.ndarray:
-    """Returns the rotation, float64 [3, 3], about an axis by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(turn))
-    cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
-    if angle < 1e-12:
-        return np.asarray(np.eye(3) + cross)
-    once = cross / angle
-    return np.asarray(np.eye(3) + math.sin(angle) * once + (1 - math.cos(angle)) * once @ once)
+    """Returns the rotation, float64 [..., 3, 3], about an axis by its length in radians."""
+    from scipy.spatial.transform import Rotation  # as in `turning`
+
+    return Rotation.from_rotvec(turn).as_matrix()
