@@ -97,10 +97,7 @@ def _surface_distances(scene: Scene, reach: float) -> np.ndarray:
     distance_N = np.full(scene.particle_count, np.inf)
     tree = cKDTree(scene.position_N3)
     for obstacle in scene.obstacles:
-        vertex_V3 = np.asarray(obstacle.vertex_V3, np.float64)
-        if obstacle.motion is not None:
-            vertex_V3 = obstacle.motion.place(vertex_V3, 0.0)
-        corner_F33 = vertex_V3[obstacle.triangle_F3].reshape(-1, 3, 3)
+        corner_F33 = obstacle.at(0.0).corners
         centre_F3 = corner_F33.mean(axis=1)
         radius_F = np.sqrt(((corner_F33 - centre_F3[:, None]) ** 2).sum(axis=2).max(axis=1, initial=0.0))
         for corner_33, near in zip(corner_F33, tree.query_ball_point(centre_F3, radius_F + reach), strict=True):

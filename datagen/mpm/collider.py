@@ -23,7 +23,6 @@ The nodes near a moving obstacle change. So kernels read its surface from sample
 (datagen.mpm.body_kernel), which datagen.mpm.body computes once.
 """
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +57,7 @@ class Collider:
         """Returns the number of particles inside closed obstacles at a time in seconds."""
         inside = np.zeros(len(position_N3), bool)
         for obstacle in self.closed:
-            inside |= contains(position_N3, placed(obstacle, time))
+            inside |= contains(position_N3, obstacle.at(time))
         return int(inside.sum())
 
 
@@ -113,13 +112,6 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
         ),
         tuple(bodies),
     )
-
-
-def placed(obstacle: Obstacle, time: float) -> Obstacle:
-    """Returns the obstacle in its pose at a time in seconds."""
-    if obstacle.motion is None:
-        return obstacle
-    return dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time))
 
 
 class _Surface:

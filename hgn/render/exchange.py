@@ -241,9 +241,8 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
             _export(path.with_stem(f"{path.stem}_obstacle_{index}"), obstacle.vertex_V3, obstacle.triangle_F3)
             continue
         for frame in range(rollout.frame_count):
-            vertex_V3 = obstacle.motion.place(obstacle.vertex_V3, frame / rollout.frame_rate_hz)
             target = path.with_stem(f"{path.stem}_obstacle_{index}_{frame:0{digits}d}")
-            _export(target, vertex_V3, obstacle.triangle_F3)
+            _export(target, obstacle.at(frame / rollout.frame_rate_hz).vertex_V3, obstacle.triangle_F3)
 
 
 def _export(path: Path, vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> None:

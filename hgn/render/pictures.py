@@ -3,7 +3,6 @@
 Shape legend: T frames, N particles.
 """
 
-import dataclasses
 import functools
 import io
 import json
@@ -205,17 +204,8 @@ def _stage(rollout: Rollout, size: int) -> Stage:
 
 def _place_obstacles(stage: Stage, rollout: Rollout, frame: int) -> None:
     """Moves the obstacles with keyframes to their pose in this frame."""
-    if all(obstacle.motion is None for obstacle in rollout.obstacles):
-        return
-    time_s = frame / rollout.frame_rate_hz
-    stage.place(
-        [
-            obstacle
-            if obstacle.motion is None
-            else dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time_s))
-            for obstacle in rollout.obstacles
-        ]
-    )
+    if any(obstacle.motion is not None for obstacle in rollout.obstacles):
+        stage.place([obstacle.at(frame / rollout.frame_rate_hz) for obstacle in rollout.obstacles])
 
 
 def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, rollout: Rollout) -> Image.Image:

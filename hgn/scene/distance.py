@@ -5,7 +5,7 @@ Shape legend: P points (or point-triangle pairs), F triangles, T tree nodes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -85,9 +85,7 @@ def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle], time
     """Returns the fraction of particles inside closed obstacles, which are where their motion places them at a time."""
     inside_N = np.zeros(len(position_N3), bool)
     for obstacle in obstacles:
-        if obstacle.motion is not None:
-            obstacle = replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time_s))
-        inside_N |= contains(position_N3, obstacle)
+        inside_N |= contains(position_N3, obstacle.at(time_s))
     return float(inside_N.mean()) if len(inside_N) else 0.0
 
 

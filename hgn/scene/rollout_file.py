@@ -315,11 +315,9 @@ def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.
     places = [np.zeros((len(time_T), 0, 3), np.float32)]
     triangles, first = [np.zeros((0, 3), np.int64)], 0
     for obstacle in obstacles:
-        rest_V3, motion = obstacle.vertex_V3, obstacle.motion
-        moved = [rest_V3 if motion is None else motion.place(rest_V3, time) for time in time_T]
-        places.append(np.stack(moved).astype(np.float32))
+        places.append(np.stack([obstacle.at(time).vertex_V3 for time in time_T]).astype(np.float32))
         triangles.append(obstacle.triangle_F3.astype(np.int64) + first)
-        first += len(rest_V3)
+        first += len(obstacle.vertex_V3)
     counts = [len(obstacle.triangle_F3) for obstacle in obstacles]
     number_F = np.repeat(np.arange(len(obstacles), dtype=np.int32), counts)
     return np.concatenate(places, axis=1), np.concatenate(triangles), number_F

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,12 @@ class Obstacle:
     def corners(self) -> np.ndarray:
         """Returns the corners of the obstacle's triangles, float64 [F, 3, 3]."""
         return np.asarray(self.vertex_V3, np.float64)[self.triangle_F3]
+
+    def at(self, time_s: float) -> Obstacle:
+        """Returns the obstacle in its pose at a time."""
+        if self.motion is None:
+            return self
+        return replace(self, vertex_V3=self.motion.place(self.vertex_V3, time_s))
 
 
 def all_corners(obstacles: Sequence[Obstacle]) -> np.ndarray:

@@ -279,8 +279,8 @@ def notes_on_files(scene: Scene) -> list[str]:
     for group, count in zip(scene.specification["groups"], scene.specification["particle_counts"], strict=False):
         position_N3, first = scene.position_N3[first : first + count], first + count
         if group.get("particles") is not None:
-            for obstacle in map(_at_start, scene.obstacles):
-                if inside := int(contains(position_N3, obstacle).sum()):
+            for obstacle in scene.obstacles:
+                if inside := int(contains(position_N3, obstacle.at(0.0)).sum()):
                     notes.append(f"{inside} of {count} particles of {group['particles']} lie inside {obstacle.name}")
     for entry, obstacle in zip(entries, scene.obstacles, strict=False):
         name, key, unit = entry.get("mesh"), "scale", f" ({MILLIMETRES})"
@@ -289,7 +289,7 @@ def notes_on_files(scene: Scene) -> list[str]:
         elif not obstacle.closed:
             remedy = "close its holes, or write bodies that touch as two obstacles"
             notes.append(f"a sheet, not a solid, because it is not watertight: {name}; {remedy}")
-        begin = _at_start(obstacle)
+        begin = obstacle.at(0.0)
         low_B3, high_B3 = (obstacle.motion or AT_REST).boxes(obstacle.vertex_V3)
         around = ((low_B3 <= 0) & (high_B3 >= scene.domain_size)).all()
         name = f"{name} ({extent(begin.vertex_V3)})"
@@ -300,12 +300,6 @@ def notes_on_files(scene: Scene) -> list[str]:
         elif np.ptp(begin.vertex_V3, axis=0).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name}; see {key}")
     return notes
-
-
-def _at_start(obstacle: Obstacle) -> Obstacle:
-    """Returns the obstacle at its place in frame 0."""
-    move = obstacle.motion
-    return obstacle if move is None else dataclasses.replace(obstacle, vertex_V3=move.place(obstacle.vertex_V3, 0.0))
 
 
 def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
@@ -424,7 +418,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
 
 
 def _require_clear(name: str, position_N3: np.ndarray, obstacles: Sequence[Obstacle], file: SceneFile) -> None:
-    for obstacle in map(_at_start, obstacles):
+    for obstacle in (each.at(0.0) for each in obstacles):
         if inside := int(contains(position_N3, obstacle).sum()):
             unit = "" if _reaches(obstacle, file.domain_size, file.cell_size) else f", or its scale ({MILLIMETRES})"
             extents = f"particles: {extent(position_N3)}; obstacle: {extent(obstacle.vertex_V3)}"

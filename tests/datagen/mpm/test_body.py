@@ -9,7 +9,7 @@ import taichi as ti
 from mpm_scenes import BOX, CELL, CONFIG, box_corners, particles, sheet
 
 from datagen.mpm.body_kernel import move_bodies, nearest_surface
-from datagen.mpm.collider import HIDDEN, SEEN, build_collider, placed
+from datagen.mpm.collider import HIDDEN, SEEN, build_collider
 from datagen.mpm.device import initialise
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.layout import BLOCK_NODES, KEY, STATE, VALUE
@@ -80,7 +80,7 @@ def test_contacts_in_a_turned_frame(name):
         find_surfaces(found, other, *arrays)
         found, other = (array.to_numpy().reshape(-1, 2, 3) for array in (found, other))
         launch.release()
-        still = dataclasses.replace(placed(moving, 0.0), motion=None)
+        still = dataclasses.replace(moving.at(0.0), motion=None)
         collider = build_collider(dataclasses.replace(scene, obstacles=(still,)), 0.5)
         node = np.ravel_multi_index(tuple(collider.node_K3.T), (NODES,) * 3)
         others = np.setdiff1d(np.arange(NODES**3), node)
