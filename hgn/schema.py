@@ -107,6 +107,12 @@ FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != "
 PATH_RULE = "a path of at most 4,095 bytes, 255 in each name"  # limits of file systems
 
 
+def triple(values: Iterable[float]) -> Vector:
+    """Returns three numbers of any kind as plain ones."""
+    x, y, z = map(float, values)
+    return x, y, z
+
+
 def is_path(text: str) -> bool:
     """Returns whether a text follows PATH_RULE. A URL may be longer."""
     data = text.encode(errors="surrogatepass")

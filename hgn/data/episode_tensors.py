@@ -19,7 +19,8 @@ from hgn.scene.episode_obstacles import field_of_episode
 from hgn.scene.history import frames_before
 from hgn.scene.moving import MovingObstacle, moving_of_episode
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
+from hgn.scene.symmetry import Symmetry, scene_symmetries
+from hgn.schema import Vector, triple
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +84,7 @@ def seen_surfaces(episode: Episode, network: NetworkConfig) -> ObstacleGrid:
 
 def frame_gravity(episode: Episode) -> Vector:
     """Returns gravity in domain units per frame squared."""
-    x, y, z = (value / episode.frame_rate_hz**2 for value in episode.gravity)
-    return x, y, z
+    return triple(value / episode.frame_rate_hz**2 for value in episode.gravity)
 
 
 def shown_symmetries(episode: Episode, network: NetworkConfig) -> tuple[Symmetry, ...]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hgn.schema import Vector
+from hgn.schema import Vector, triple
 
 _BLOCK_PARTICLES = 1 << 18  # number of particles times number of frames of a block
 _ROWS_ABREAST = 512  # number of rows [3] that are summed side by side
@@ -35,7 +35,7 @@ class Moments:
         if not len(flat):
             return Moments()
         mean = _sums(flat, np.zeros(3), 1) / len(flat)
-        return Moments(len(flat), _vector(mean), _vector(_sums(flat, mean, 2)))
+        return Moments(len(flat), triple(mean), triple(_sums(flat, mean, 2)))
 
     def merge(self, other: Moments) -> Moments:
         """Returns the moments of the union."""
@@ -54,7 +54,7 @@ class Moments:
     @property
     def std(self) -> Vector:
         """Returns the standard deviation per axis (divided by the count); zero without values."""
-        return _vector(np.sqrt(np.array(self.squared_deviation) / max(self.count, 1)))
+        return triple(np.sqrt(np.array(self.squared_deviation) / max(self.count, 1)))
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,3 @@ def _sums(flat: np.ndarray, origin: np.ndarray, power: int) -> np.ndarray:
             sums = offset.sum(axis=0) if power == 1 else np.einsum("ij,ij->j", offset, offset)
             total = total + sums.reshape(abreast, 3).sum(axis=0)
     return total
-
-
-def _vector(values: np.ndarray) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

@@ -166,8 +166,3 @@ def unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
 def choice(options: Sequence[str], rng: np.random.Generator) -> str:
     """Returns one of the options with equal probabilities."""
     return options[int(rng.random() * len(options))]
-
-
-def triple(point: np.ndarray) -> Vector:
-    x, y, z = point.tolist()
-    return x, y, z

@@ -26,13 +26,12 @@ from hgn.scene.placement import (
     place_shape,
     thrown,
     too_near,
-    triple,
 )
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.scene.world import Layout, draw_layout
-from hgn.schema import ConfigError, Vector, require
+from hgn.schema import ConfigError, Vector, require, triple
 
 REPORT_SEED = 1_000_000  # first seed of scenes that reports draw; seeds of data sets are hashes
 MAXIMUM_TILTED_GRAVITY = 19.6  # domain units per second squared

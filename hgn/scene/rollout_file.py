@@ -31,7 +31,7 @@ from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
-from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds
+from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds, triple
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
 
@@ -401,9 +401,9 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
         position_TN3=position_TP3[:, vertices:],
         material_N=material_N,
         obstacles=tuple(_read_obstacle(entry) for _, entry in sorted(own["obstacles"].items())),
-        domain_size=_triple(own.attrs["domain_size"]),
+        domain_size=triple(own.attrs["domain_size"].tolist()),
         frame_rate_hz=float(own.attrs["frame_rate_hz"].item()),
-        gravity=_triple(own.attrs["gravity"]),
+        gravity=triple(own.attrs["gravity"].tolist()),
         cell_size=float(own.attrs["cell_size"].item()),
         source=source,
         reference_TN3=own["reference"][()] if "reference" in own else None,
@@ -438,11 +438,6 @@ def _read_motion(entry: h5py.Group) -> Motion:
     for (name, value), shape in zip(arrays.items(), shapes, strict=True):
         if value.shape != shape:
             raise ConfigError(f"{entry.name}: {name} must have shape {shape}, got {value.shape}")
-    pivot = _triple(entry.attrs["pivot"])
+    pivot = triple(entry.attrs["pivot"].tolist())
     require(all(abs(x) <= LARGEST for x in pivot), f"{entry.name}: pivot", "finite and at most 1e15", list(pivot))
     return Motion(**arrays, pivot=pivot)
-
-
-def _triple(values: Any) -> Vector:
-    x, y, z = (float(value) for value in values.tolist())
-    return x, y, z

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product
 
-from hgn.schema import Vector
+from hgn.schema import Vector, triple
 from hgn.system.splitmix import splitmix64
 
 CELL_BITS = 17  # bits for a number of cells, as in a cell's key
@@ -30,13 +30,11 @@ class Symmetry:
     @property
     def mirror_sum(self) -> Vector:
         """Returns the sum of a mirrored coordinate and its image, domain units."""
-        x, y, z = (count * self.cell_size for count in self.cells)
-        return x, y, z
+        return triple(count * self.cell_size for count in self.cells)
 
     def direction(self, vector: Vector) -> Vector:
         """Returns the image of a direction, for example of gravity."""
-        x, y, z = (-vector[s] if m else vector[s] for s, m in zip(self.source, self.mirrored, strict=True))
-        return x, y, z
+        return triple(-vector[s] if m else vector[s] for s, m in zip(self.source, self.mirrored, strict=True))
 
     @cached_property
     def code(self) -> int:

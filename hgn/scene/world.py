@@ -16,8 +16,8 @@ from hgn.scene.funnel import Quaternion
 from hgn.scene.group import WALL_CELLS, Region, particle_count, points_in_ball, random_direction, region_of
 from hgn.scene.kinds import MAXIMUM_PARTICLES, MOVING_FRACTION, MOVING_RANGES, RANGES
 from hgn.scene.motion import Keyframes, Motion
-from hgn.scene.placement import ROUNDING, Body, Placed, blocked, choice, filled, place_shape, triple
-from hgn.schema import ConfigError, Vector
+from hgn.scene.placement import ROUNDING, Body, Placed, blocked, choice, filled, place_shape
+from hgn.schema import ConfigError, Vector, triple
 
 DRAWS = 500  # attempts to place one scene
 NEAREST_CELLS = 1.0  # smallest distance between obstacles and bodies, in solver cells

@@ -28,7 +28,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import write_rollout
 from hgn.scene.scene_file import ObstacleEntry
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, require, triple
 from hgn.viewer.placed import PlacedObstacle, plain
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
@@ -243,8 +243,8 @@ class PlayPage:
         @self.gravity.on_update
         def _(event: Any) -> None:
             if event.client is not None:
-                x, y, z = (float(value) for value in event.target.value)
-                self.do(lambda: set_gravity((x, y, z)), event.client, "gravity")
+                gravity = triple(event.target.value)
+                self.do(lambda: set_gravity(gravity), event.client, "gravity")
 
         @self.weights.on_update
         def _(event: Any) -> None:
@@ -413,8 +413,8 @@ class PlayPage:
         @mesh.on_drag("left")
         async def _(event: viser.SceneNodeDragEvent) -> None:
             def moved(before: PlacedObstacle, begin: Any) -> PlacedObstacle:
-                x, y, z = (np.array(before.position) + event.end_position - begin.start_position).tolist()
-                return replace(self.shown[number], position=(x, y, z))
+                position = np.array(before.position) + event.end_position - begin.start_position
+                return replace(self.shown[number], position=triple(position))
 
             drag(event, moved)
 

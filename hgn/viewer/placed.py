@@ -24,7 +24,7 @@ from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
 from hgn.scene.surface import MAXIMUM_SAMPLES
-from hgn.schema import Vector
+from hgn.schema import Vector, triple
 
 JUMP = 0.1  # longest displacement of an obstacle in a frame that moves particles along, domain units
 LONGEST_STEM = 32  # characters of a file's name that a page shows
@@ -74,8 +74,7 @@ class PlacedObstacle:
     def turned(self, degrees: float) -> "PlacedObstacle":
         """Returns the obstacle rotated further about the vertical."""
         matrix = euler_rotation((0.0, degrees, 0.0)) @ self.rotation_33
-        x, y, z = Rotation.from_matrix(matrix).as_euler("xyz", degrees=True)
-        return dataclasses.replace(self, rotation=(float(x), float(y), float(z)))
+        return dataclasses.replace(self, rotation=triple(Rotation.from_matrix(matrix).as_euler("xyz", degrees=True)))
 
     def mesh(self, motion: Motion | None = None) -> Obstacle:
         """Returns the triangles at the obstacle's place."""

@@ -24,7 +24,7 @@ from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
-from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping
+from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping, triple
 from hgn.viewer.placed import Body, PlacedObstacle, moved_from, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
@@ -213,8 +213,7 @@ class PlaySession:
         wall = WALL_CELLS * self.cell_size
         reach = np.array([radius, radius if half_height is None else half_height, radius]) + wall
         high = np.maximum(np.array(self.domain_size) - reach, reach)
-        x, y, z = np.clip(position, reach, high)
-        return float(x), float(y), float(z)
+        return triple(np.clip(position, reach, high))
 
     def _enter(self, position_C3: np.ndarray, spout: Spout) -> int:
         """Adds candidates outside closed obstacles, up to the maximum number."""
@@ -261,8 +260,8 @@ class PlaySession:
         """Adds a mesh file around a place. The longest side of its bounding box becomes `size`."""
         low, high = (bound(load_mesh(path).vertex_V3, axis=0) for bound in (np.min, np.max))
         scale = size / float((high - low).max())
-        x, y, z = (np.array(middle) - scale * 0.5 * (low + high)).tolist()
-        return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
+        position = triple(np.array(middle) - scale * 0.5 * (low + high))
+        return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=position), path.parent)
 
     def free_place(self, size: float) -> Vector:
         """Returns the centre of a free cube in the domain, as near as possible to its middle at 0.3 of its height.
@@ -278,8 +277,7 @@ class PlaySession:
             if (np.abs(centre - 0.5 * domain) + 0.5 * size > 0.5 * domain + 1e-9).any():
                 continue  # a part of it would be beyond a wall
             if not (np.abs(taken_A3 - centre) < 0.5 * size + self.cell_size).all(axis=1).any():
-                x, y, z = centre.tolist()
-                return x, y, z
+                return triple(centre)
         raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; take a smaller one")
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
