@@ -3,14 +3,12 @@
 import json
 import sys
 import time
-from typing import Any, TextIO
+from typing import Any
 
 from tqdm import tqdm
 
 from hgn.schema import require
-from hgn.system.progress import advance_to
-
-_SPARSE_SECONDS = 30.0  # interval between lines if stderr is not a terminal
+from hgn.system.progress import advance_to, bar
 
 
 class Progress:
@@ -41,58 +39,32 @@ class Progress:
 class BarProgress(Progress):
     """Shows a bar of simulated frames, which moves within a long episode. Without a terminal it prints a few lines."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = stream or sys.stderr
-        self._bar: tqdm | None = None
-        self._done = self._total = self._frames = 0
-        self._running: dict[int, int] = {}
-        self._last_line = 0.0
-
     def start(self, done: int, total: int, frames: int) -> None:
         self._done, self._total, self._frames = done, total, frames
-        if self._stream.isatty():
-            self._bar = tqdm(
-                desc=f"episodes {done}/{total}", total=total * frames, initial=done * frames, unit="frame",
-                file=self._stream, dynamic_ncols=True,
-            )  # fmt: skip
-        self._show(force=True)
+        self._running: dict[int, int] = {}
+        self._bar = bar(f"episodes {done}/{total}", total * frames, done * frames, "frame")
 
     def frame(self, worker: int, frame: int, scenes: int) -> None:
         self._running[worker] = frame * scenes
-        self._show()
+        self.found(0)
 
     def episode(self, key: str) -> None:
         self.found(1)
 
     def found(self, count: int) -> None:
         self._done += count
-        self._show()
+        frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
+        self._bar.set_description(f"episodes {self._done}/{self._total}", refresh=False)
+        advance_to(self._bar, frames)  # fewer than before if a launch has failed
 
     def shard(self, name: str, episodes: int, revision: int) -> None:
         self.message(f"published {name} ({episodes} episode{'s' if episodes > 1 else ''})")
 
     def message(self, text: str) -> None:
-        if self._bar is not None:
-            self._bar.write(text, file=self._stream)
-        else:
-            print(text, file=self._stream, flush=True)
+        tqdm.write(text, file=sys.stderr)
 
     def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-    def _show(self, force: bool = False) -> None:
-        frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
-        text = f"episodes {self._done}/{self._total}"
-        if self._bar is not None:
-            self._bar.set_description(text, refresh=False)
-            advance_to(self._bar, frames)  # fewer than before if a launch has failed
-            if force:
-                self._bar.refresh()
-        elif force or time.monotonic() - self._last_line > _SPARSE_SECONDS:
-            self._last_line = time.monotonic()
-            print(f"{text}, frames {frames}/{self._total * self._frames}", file=self._stream, flush=True)
+        self._bar.close()
 
 
 class JsonProgress(Progress):
