@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_103,
+    "hgn": 34_118,
     "datagen": 8_952,
     "tools": 6_367,
-    "tests": 34_580,
+    "tests": 34_592,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

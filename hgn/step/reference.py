@@ -16,7 +16,8 @@ docs/concepts/constraints.md derives the constraints. `Deformation` computes the
 
 The remaining deformation is reduced in the same way on cells four times as large, except for FRICTIONLESS materials.
 **Obstacles** stop particles on both sides of a triangle. A particle exactly on a plane counts as on the normal's side.
-Suffixes of names: N particles, C coarsest cells, K centres of cells, F triangles, P pairs of particles and triangles.
+Suffixes of names: N particles, C coarsest cells, K centres of cells, F triangles, P pairs of particles and triangles,
+L lists of triangles near a particle.
 """
 
 from dataclasses import dataclass, replace
@@ -41,6 +42,7 @@ FRICTIONLESS = ("water",)  # materials without rest on the larger cells
 # A particle that starts nearer than this and approaches ends SLACK * clearance farther away than it started.
 SLACK = 0.02
 SURFACES = 3  # largest number of triangles that shift the end of one path; at the next triangle the path ends
+PAIRS_AT_ONCE = 1 << 20  # largest number of pairs of particles and triangles; a pair takes 500 bytes
 LEAST_CREASE = 1e-4  # squared sine of the angle between two planes; planes at a smaller angle count as one
 
 
@@ -301,7 +303,13 @@ def first_stop(
     [N, 3]; the fraction of the path before the first triangle [N, 1]. Without a stop, shift and normal are zero.
     Positions must be finite. Another triangle may stop the path to the shifted end.
     """
-    particle_P, triangle_P = _pairs(barriers, before_N3, after_N3, scene_N)
+    candidates = _pairs(barriers, before_N3, after_N3, scene_N)
+    if candidates is None:
+        halves = zip(before_N3.chunk(2), after_N3.chunk(2), scene_N.chunk(2), strict=True)
+        stops = (first_stop(barriers, *half) for half in halves)
+        hit_N, shift_N1, normal_N3, free_N1 = map(torch.cat, zip(*stops, strict=True))
+        return hit_N, shift_N1, normal_N3, free_N1
+    particle_P, triangle_P = candidates
     row_P24 = barriers.row_F24.to(before_N3.dtype)[triangle_P]
     before_P3, way_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P]
     normal_P3 = row_P24[:, :3]
@@ -336,27 +344,34 @@ def first_stop(
 
 def _pairs(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns candidate pairs: particles and triangles, int64 [P]. They include every pair that meets."""
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Returns candidate pairs: particles and triangles, int64 [P]. They include every pair that meets.
+
+    Returns None for several particles with more than PAIRS_AT_ONCE pairs.
+    """
     if is_exporting():
         return pairs_of_boxes(barriers, before_N3, after_N3, scene_N)
     before_N3, after_N3 = before_N3.detach(), after_N3.detach()
     way_N3 = after_N3 - before_N3
     pieces_N = torch.ceil(torch.linalg.vector_norm(way_N3, dim=-1) / barriers.cell_size).clamp(min=1)
-    particles, triangles = [scene_N[:0]], [scene_N[:0]]
+    particles, cells = [scene_N[:0]], [scene_N[:0]]
     for piece in range(int(pieces_N.max()) if len(pieces_N) else 0):
         here_N = torch.nonzero(pieces_N > piece).flatten() if piece else torch.arange(len(way_N3)).to(scene_N)
         share_N1 = ((piece + 0.5) / pieces_N[here_N])[:, None]
         cell_N3 = torch.floor((before_N3[here_N] + share_N1 * way_N3[here_N]) / barriers.cell_size)
         cell_N3 = cell_N3.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1).long()
         index_N, found_N = find(barriers.key_Q, pack(scene_N[here_N], cell_N3))
-        index_N, here_N = index_N[found_N], here_N[found_N]
-        count_N = barriers.start_Q[index_N + 1] - barriers.start_Q[index_N]
-        before = torch.repeat_interleave(count_N.cumsum(0) - count_N, count_N)
-        entry = torch.arange(len(before), device=before.device) - before
-        triangles.append(barriers.triangle_E[torch.repeat_interleave(barriers.start_Q[index_N], count_N) + entry])
-        particles.append(torch.repeat_interleave(here_N, count_N))
-    return torch.cat(particles), torch.cat(triangles)
+        cells.append(index_N[found_N])
+        particles.append(here_N[found_N])
+    particle_L, cell_L = torch.cat(particles), torch.cat(cells)
+    start_L = barriers.start_Q[cell_L]
+    count_L = barriers.start_Q[cell_L + 1] - start_L
+    count = int(count_L.sum())
+    if count > PAIRS_AT_ONCE and len(scene_N) > 1:
+        return None
+    shift_P = torch.repeat_interleave(start_L - count_L.cumsum(0) + count_L, count_L, output_size=count)
+    entry_P = torch.arange(count, device=scene_N.device) + shift_P
+    return torch.repeat_interleave(particle_L, count_L, output_size=count), barriers.triangle_E[entry_P]
 
 
 def pairs_of_boxes(

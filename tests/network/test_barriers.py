@@ -9,6 +9,7 @@ from hgn.network.features import ParticleState
 from hgn.scene.barrier import CELLS, MARGIN, build_barrier
 from hgn.scene.rotation import euler_rotation
 from hgn.schema import ConfigError
+from hgn.step import reference
 from hgn.step.reference import SLACK, FreeMotion, constrained, pairs_of_boxes
 from hgn.step_config import StepConfig
 
@@ -218,6 +219,17 @@ def test_lists_hold_all_that_is_met(monkeypatch):
                 patch.setattr("hgn.step.reference._pairs", pairs)
                 assert np.array_equal(listed_N3, ended(before_N3, after_N3, barriers)[0])
     assert (listed_N3 != after_N3).any(1).all()
+
+
+def test_pairs_in_memory_are_bounded(monkeypatch):
+    """A mesh of 1 MB may have 100,000 triangles near each particle. Paths are stopped in parts, with equal results."""
+    corner_F33, before_N3, after_N3 = scattered(0)
+    barriers, sizes, covers = barriers_of(corner_F33), [], reference._covers
+    expected = ended(before_N3, after_N3, barriers)
+    monkeypatch.setattr(reference, "PAIRS_AT_ONCE", 500, raising=False)
+    monkeypatch.setattr(reference, "_covers", lambda row, place: sizes.append(len(row)) or covers(row, place))
+    np.testing.assert_array_equal(ended(before_N3, after_N3, barriers), expected)
+    assert sum(sizes) > 5000 and max(sizes) <= 500
 
 
 def test_obstacles_that_are_none():
