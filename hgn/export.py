@@ -128,17 +128,9 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **s
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint, checkpoint_path)
     change_step(network, step_changes)
-    data = data_of_checkpoint(checkpoint)
-    info = WeightsInfo(
-        network=network.config,
-        frame_rate_hz=data.frame_rate_hz,
-        obstacle_cell_size=data.obstacle_cell_size,
-        gravity=data.gravity,
-        maximum_initial_speed=data.maximum_initial_speed,
-        own_ranges=data.own_ranges,
-        updates=Progress.of(checkpoint).updates,
-        provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
-    )
+    data = dict(vars(data_of_checkpoint(checkpoint)))
+    origin = provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.pop("config_hash")}
+    info = WeightsInfo(network.config, **data, updates=Progress.of(checkpoint).updates, provenance=origin)
     save_weights(out, network, info, stored_precision)
 
 

@@ -21,6 +21,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import current_names, with_step
 from hgn.schema import (
+    Bounded,
     ConfigError,
     NonNegative,
     OrdinarySize,
@@ -29,7 +30,6 @@ from hgn.schema import (
     near_file,
     near_name,
     require,
-    require_bounds,
     to_mapping,
 )
 from hgn.step_config import StepConfig
@@ -43,7 +43,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # folder of the shipp
 
 
 @dataclass(frozen=True)
-class WeightsInfo:
+class WeightsInfo(Bounded):
     """The metadata of a weights file."""
 
     network: NetworkConfig
@@ -58,9 +58,6 @@ class WeightsInfo:
     step: StepConfig = field(default_factory=StepConfig)  # constraints of each frame
     updates: int = 0  # number of updates of the training
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
