@@ -147,7 +147,7 @@ RULES = {
         ({"devices": 0}, "devices must be at least 1"),
         ({"device": "cuda:1"}, "device must be auto, cpu or cuda"),
         ({"batches": 0}, "batches must be at least 1"),
-        ({"backends": ["slow"]}, r"backends\[0\] must be torch or triton"),
+        ({"backends": ["slow"]}, r"backends\[0\] must be one of torch, triton"),
         ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
     ],
     command(StabilityNetworkConfig, weights="w"): [

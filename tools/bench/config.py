@@ -1,9 +1,10 @@
 """The options of `python -m tools.bench`."""
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
-from hgn.config import PRECISIONS, NetworkConfig
-from hgn.schema import OneOrMore, Positive, require, require_bounds
+from hgn.config import NetworkConfig, Precision
+from hgn.schema import OneOrMore, Positive, one_of, require, require_bounds
 from tools.report import ReportConfig
 
 FRAME_CASES = ("frame", "torch_frame", "gns_frame", "mpm_frame")
@@ -17,21 +18,18 @@ class BenchConfig(ReportConfig):
 
     # frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, mpm_frame (the solver);
     # null: all that differ on this machine
-    cases: tuple[str, ...] | None = None
+    cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     particles: tuple[OneOrMore, ...] | None = None  # of a scene; null: 4296, 40000, 400000 on a GPU, 4296 on a CPU
     # scenes side by side, with the smallest number of particles; null: 1, 8, 32 on a GPU, 1 on a CPU
     scenes: tuple[OneOrMore, ...] | None = None
     # fp32, tf32, fp16 (backend triton); null: tf32 and fp16 on a GPU, fp32 on a CPU
-    precisions: tuple[str, ...] | None = None
+    precisions: tuple[Precision, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)  # GNS has its width, and 10 steps
     # after which contenders that take turns are sampled no more, but five times at least and 50 times at most
     seconds: Positive[float] = 20.0
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        for name, known in (("cases", CASES), ("precisions", PRECISIONS)):
-            for i, value in enumerate(getattr(self, name) or ()):
-                require(value in known, f"{name}[{i}]", f"one of {', '.join(known)}", value)
         require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
 
     @property

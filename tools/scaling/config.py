@@ -1,9 +1,10 @@
 """Settings of `python -m tools.scaling`; read without torch."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from hgn.config import NetworkConfig, Precision
-from hgn.schema import OneOrMore, Positive, require, require_bounds
+from hgn.schema import OneOrMore, Positive, one_of, require, require_bounds
 from tools.report import ReportConfig
 
 
@@ -15,7 +16,10 @@ class ScalingConfig(ReportConfig):
     scenes: OneOrMore = 8  # on each device
     particles: OneOrMore = 4_296  # of a scene, on average
     batches: OneOrMore = 8  # of each device; a sample is one update on each batch
-    backends: tuple[str, ...] = ("torch", "triton")  # of training; triton is skipped without GPUs
+    backends: tuple[Annotated[str, one_of("torch", "triton")], ...] = (
+        "torch",
+        "triton",
+    )  # of training; triton is skipped without GPUs
     precision: Precision = "tf32"  # or fp32, fp16 (backend triton; backend torch then takes tf32)
     network: NetworkConfig = field(default_factory=NetworkConfig)  # that is trained
     # after which contenders are sampled no more, but five times at least and 20 times at most
@@ -23,7 +27,5 @@ class ScalingConfig(ReportConfig):
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        for i, backend in enumerate(self.backends):
-            require(backend in ("torch", "triton"), f"backends[{i}]", "torch or triton", backend)
         require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)
         require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
