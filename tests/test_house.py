@@ -16,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_118,
+    "hgn": 34_098,
     "datagen": 8_952,
-    "tools": 6_367,
+    "tools": 6_362,
     "tests": 34_592,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config

@@ -187,7 +187,8 @@ class LogLines(Callback):
             "epoch": float(pl_module.sampler_state.epoch),
         }
         self._time, self._update, self._waited_s = now, update, waited_s
-        values |= pl_module.updates.pool_figures
+        if pl_module.updates.pool is not None:
+            values |= pl_module.updates.pool.figures
         if pl_module.device.type == "cuda":
             values["gpu_memory_gb"] = torch.cuda.max_memory_allocated() / 1e9
         log(trainer, self.run, update, values)

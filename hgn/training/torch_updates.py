@@ -36,21 +36,17 @@ class TorchUpdates:
         if self._device.type == "cpu":
             keep_freed_memory()
         self._guard = GradientGuard(trained.counters)
-        self._pool: PushforwardPool[Episode, BatchSample] | None = None
+        self.pool: PushforwardPool[Episode, BatchSample] | None = None
         if training.pushforward_fraction > 0:
-            self._pool = PushforwardPool(TorchScenes(trained.result), training, rank)
-
-    @property
-    def pool_figures(self) -> dict[str, float]:
-        return {} if self._pool is None else self._pool.figures
+            self.pool = PushforwardPool(TorchScenes(trained.result), training, rank)
 
     def run(self, chunk: WindowChunk, first_update: int) -> None:
-        if self._pool is not None and chunk.starts:
-            self._pool.refresh(chunk.starts)
+        if self.pool is not None and chunk.starts:
+            self.pool.refresh(chunk.starts)
         for update, samples in enumerate(chunk.samples, first_update):
             batch = chunk.batch
-            if self._pool is not None or batch is None:
-                own = samples if self._pool is None else self._pool.replaced(samples, update)
+            if self.pool is not None or batch is None:
+                own = samples if self.pool is None else self.pool.replaced(samples, update)
                 batch = join(own, self.trained.network.config)
             self._update(batch.to(self._device), update)
 

@@ -77,16 +77,12 @@ class TritonUpdates:
         self._read_moments()
         if self._averaged is not None:
             self.updates.average = self._packed(self._averaged)
-        self._pool: PushforwardPool[DeviceEpisode, DeviceSample] | None = None
+        self.pool: PushforwardPool[DeviceEpisode, DeviceSample] | None = None
         if training.pushforward_fraction > 0:
             simulated = trained.result
             assert isinstance(simulated, HierarchicalGraphNetwork)
             self._scenes = TritonScenes(simulated, training, self._obstacle_cell_size, precision)
-            self._pool = PushforwardPool(self._scenes, training, ranks.rank)
-
-    @property
-    def pool_figures(self) -> dict[str, float]:
-        return {} if self._pool is None else self._pool.figures
+            self.pool = PushforwardPool(self._scenes, training, ranks.rank)
 
     def run(self, chunk: EpisodeChunk, first_update: int) -> None:
         """Raises: ConfigError for positions that are not finite; ParityError if no precision passes the first check."""
@@ -98,14 +94,14 @@ class TritonUpdates:
         if self.parity is None:
             with self._timed("checking the kernels"):
                 self._check(chunk)
-        if self._pool is not None and chunk.starts:
+        if self.pool is not None and chunk.starts:
             average = self.updates.average
             self._scenes.values = self.updates.values if average is None else average
             with self._timed("pushforward"):
-                self._pool.refresh([(self._episodes[i], frame) for i, frame in chunk.starts])
+                self.pool.refresh([(self._episodes[i], frame) for i, frame in chunk.starts])
         samples = [[DeviceSample(self._episodes[s.episode], *s[1:]) for s in update] for update in chunk.samples]
-        if self._pool is not None:
-            samples = [self._pool.replaced(update, first_update + i) for i, update in enumerate(samples)]
+        if self.pool is not None:
+            samples = [self.pool.replaced(update, first_update + i) for i, update in enumerate(samples)]
         numbers = range(first_update, first_update + len(samples))
         rates = [learning_rate(self.training, update) for update in numbers]
         average_weights = [average_weight(self.training, update) for update in numbers]

@@ -14,6 +14,7 @@ import torch
 from hgn.config import TrainingConfig
 from hgn.network.base import ParticleNetwork
 from hgn.training.muon import Muon
+from hgn.training.pushforward import PushforwardPool
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +45,7 @@ class Updates(Protocol):
     """Trains on chunks of samples."""
 
     precision: str  # of matrix products: fp32, tf32 or fp16
-
-    @property
-    def pool_figures(self) -> dict[str, float]:
-        """Returns the metrics of the pushforward pool; empty without one."""
+    pool: PushforwardPool[Any, Any] | None  # None without pushforward
 
     def run(self, chunk: Any, first_update: int) -> None:
         """Makes an update for each entry of `chunk.samples`. `first_update` is the number of the first one, from 0.
