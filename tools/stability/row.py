@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 from tools import report
@@ -44,7 +44,8 @@ class Report:
     def write(self) -> None:
         """Writes the JSON, if a file was given."""
         if self.file is not None:
-            rows = [{"part": self.part} | _mapping(row) for row in self.rows]
+            own = ("case", "predicted", "measured", "held", "beyond")
+            rows = [{"part": self.part} | row.more | {name: getattr(row, name) for name in own} for row in self.rows]
             report.write_report(self.file, {"meta": self.meta, "rows": rows} | self.more)
 
 
@@ -60,8 +61,3 @@ def table(rows: Sequence[Row]) -> str:
 def _figures(row: Row) -> tuple[str, str]:
     measured, predicted = (v if isinstance(v, str) else f"{v:.4g}" for v in (row.measured, row.predicted))
     return measured, predicted
-
-
-def _mapping(row: Row) -> dict[str, Any]:
-    mapping = asdict(row)
-    return mapping.pop("more") | mapping

@@ -12,7 +12,6 @@ A record consists of its length (uint64), the length's masked CRC-32C, the bytes
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from hgn.schema import ConfigError
 
@@ -31,14 +30,10 @@ def read_records(path: Path) -> Iterator[bytes]:
             _require_crc(f"{name}: length", head[:8], head[8:])
             if length > size - file.tell() - 4:
                 raise ConfigError(f"{name}: data must have {length} bytes, got {size - file.tell()}: the file is cut")
-            yield _checked(file, length, name)
+            data = file.read(length)
+            _require_crc(f"{name}: data", data, file.read(4))
+            yield data
             number += 1
-
-
-def _checked(file: BinaryIO, length: int, name: str) -> bytes:
-    data = file.read(length)
-    _require_crc(f"{name}: data", data, file.read(4))
-    return data
 
 
 def masked_crc(data: bytes) -> int:
