@@ -33,12 +33,8 @@ def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
     offset_NC3 = _offsets(scene, children, wall)
     density = scene.particles_per_cell
     return dataclasses.replace(
-        scene,
+        scene.selected(np.repeat(np.arange(scene.particle_count), children)),
         position_N3=(scene.position_N3[:, None] + offset_NC3).astype(np.float32).reshape(-1, 3),
-        velocity_N3=np.repeat(scene.velocity_N3, children, axis=0),
-        material_N=np.repeat(scene.material_N, children),
-        material_parameters={k: np.repeat(value_N, children) for k, value_N in scene.material_parameters.items()},
-        entry_s_N=None if scene.entry_s_N is None else np.repeat(scene.entry_s_N, children),
         cell_size=cell_size,
         particles_per_cell=None if density is None else density * children / volume,
     )

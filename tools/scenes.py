@@ -12,7 +12,6 @@ import numpy as np
 from hgn.scene.scene import Scene
 
 PARTICLES_PER_CELL = 8
-OF_PARTICLES = ("position_N3", "velocity_N3", "material_N")
 
 
 def random_places(size_cells: Sequence[float], seed: int = 0) -> np.ndarray:
@@ -28,12 +27,8 @@ def filled(material: int, position_N3: np.ndarray, velocity_3: Sequence[float] |
     return Scene(np.asarray(position_N3).astype(np.float32), velocity_N3, np.full(count, material, np.uint8), **more)
 
 
-def some(scene: Scene, chosen_N: np.ndarray) -> Scene:
-    """Returns a scene with some of its particles."""
-    return replace(scene, **{name: getattr(scene, name)[chosen_N] for name in OF_PARTICLES})
-
-
 def joined(scenes: Sequence[Scene]) -> Scene:
     """Returns the first scene with the particles of all."""
-    whole: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in scenes]) for name in OF_PARTICLES}
+    names = ("position_N3", "velocity_N3", "material_N")
+    whole: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in scenes]) for name in names}
     return replace(scenes[0], **whole)

@@ -323,12 +323,11 @@ class Simulator:
             entry_N = entry_frames(state.emitting, self.frame_rate_hz)
             require_free_entries(state.emitting, entered)
             for frame in sorted({*entry_N[len(state.position_N3) :].tolist()}):
-                new_N = entry_N == frame
+                own = entered.selected(entry_N == frame)
                 particles: dict[str, Any] = {
-                    name: getattr(entered, name)[new_N] for name in ("position_N3", "velocity_N3", "material_N")
+                    name: getattr(own, name) for name in ("position_N3", "velocity_N3", "material_N")
                 }
-                given = {name: value_N[new_N] for name, value_N in entered.material_parameters.items()}
-                particles["parameters"] = input_parameters(given, {}, int(new_N.sum()))
+                particles["parameters"] = input_parameters(own.material_parameters, {}, own.particle_count)
                 particles |= {"corners": None, "body_N": None, "moving": ()}  # barriers take long and are not needed
                 new = self.start([replace(state, **particles)])
                 entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))

@@ -87,15 +87,9 @@ def at_entry(scene: Scene, frame_rate_hz: float) -> Scene:
 
 def at_start(scene: Scene) -> Scene:
     """Returns the scene with only the particles that are present from the start."""
-    count = int((scene.entry_s_N <= 0).sum()) if scene.entry_s_N is not None else scene.particle_count
-    return dataclasses.replace(
-        scene,
-        position_N3=scene.position_N3[:count],
-        velocity_N3=scene.velocity_N3[:count],
-        material_N=scene.material_N[:count],
-        material_parameters={name: value[:count] for name, value in scene.material_parameters.items()},
-        entry_s_N=None,
-    )
+    if scene.entry_s_N is None:
+        return scene
+    return dataclasses.replace(scene.selected(scene.entry_s_N <= 0), entry_s_N=None)
 
 
 def require_free_entries(scene: Scene, entered: Scene) -> None:

@@ -143,3 +143,14 @@ class Scene:
     @property
     def particle_count(self) -> int:
         return len(self.position_N3)
+
+    def selected(self, chosen: np.ndarray | slice) -> Scene:
+        """Returns the scene with these of its particles."""
+        return replace(
+            self,
+            position_N3=self.position_N3[chosen],
+            velocity_N3=self.velocity_N3[chosen],
+            material_N=self.material_N[chosen],
+            material_parameters={name: value_N[chosen] for name, value_N in self.material_parameters.items()},
+            entry_s_N=None if self.entry_s_N is None else self.entry_s_N[chosen],
+        )

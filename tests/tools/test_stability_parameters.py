@@ -15,7 +15,6 @@ from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import Simulator
 from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
-from tools.scenes import some
 from tools.solver_rollouts import solver_trials
 from tools.stability import network, parameters
 from tools.stability.network import Runner, main
@@ -194,7 +193,7 @@ def test_the_command(tmp_path, monkeypatch):
 
 def thinned(scene):
     """Every thousandth particle of a kind's scenes."""
-    return lambda rng: some(made := scene(rng), np.arange(made.particle_count) % 1000 == 0)
+    return lambda rng: (made := scene(rng)).selected(np.arange(made.particle_count) % 1000 == 0)
 
 
 def test_the_stored_rows_can_fail():

@@ -6,7 +6,7 @@ grid. Shape legend: T frames, N particles, S sampled frames.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -113,13 +113,9 @@ class Film:
             return self
         counts = self.scene.specification["particle_counts"]
         own = slice(sum(counts[:group]), sum(counts[: group + 1]))
-        whole = self.scene
-        part = Scene(
-            whole.position_N3[own], whole.velocity_N3[own], whole.material_N[own], gravity=whole.gravity,
-            domain_size=whole.domain_size, cell_size=whole.cell_size, particles_per_cell=whole.particles_per_cell,
-        )  # fmt: skip
         beside = None if self.beside_far_TN3 is None else self.beside_far_TN3[:, own]
-        return Film(part, self.position_TN3[:, own], self.rate_hz, self.cell_size, self.particles_per_cell, beside)
+        scene, position_TN3 = self.scene.selected(own), self.position_TN3[:, own]
+        return replace(self, scene=scene, position_TN3=position_TN3, beside_far_TN3=beside)
 
     def place(self, frame: int) -> np.ndarray:
         """Returns the particles that have entered, float64 [N, 3]."""

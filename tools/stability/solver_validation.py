@@ -17,7 +17,7 @@ from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import SAND, WATER
 from hgn.scene.scene import Obstacle, Scene
-from tools.scenes import PARTICLES_PER_CELL, filled, random_places, some
+from tools.scenes import PARTICLES_PER_CELL, filled, random_places
 from tools.stability.row import Row, within
 from tools.stability.solver_scenes import positions, rms_speed
 
@@ -147,7 +147,7 @@ def column(aspect: float, cells: int) -> Scene:
     space = math.ceil(COLUMN_SPACE * lube(aspect) * cells)
     scene = basin(SAND, (cells, aspect * cells, cells), (space, aspect * cells + 2, space), COLUMN_RADIUS / cells, 2)
     place_N3 = _above_floor(scene.position_N3, scene.cell_size)
-    return some(scene, np.hypot(place_N3[:, 0], place_N3[:, 2]) < cells)
+    return scene.selected(np.hypot(place_N3[:, 0], place_N3[:, 2]) < cells)
 
 
 def lube(aspect: float) -> float:
@@ -215,7 +215,7 @@ def platform(slope_deg: float, cells: int) -> Scene:
     sheet = scene.obstacles[0]
     corner = sheet.vertex_V3.copy()
     corner[:, 0] = np.minimum(corner[:, 0], (WALL + cells) * scene.cell_size)
-    return dataclasses.replace(some(scene, below), obstacles=(dataclasses.replace(sheet, vertex_V3=corner),))
+    return dataclasses.replace(scene.selected(below), obstacles=(dataclasses.replace(sheet, vertex_V3=corner),))
 
 
 def surface_slope(place_N3: np.ndarray, cells: int) -> float:
