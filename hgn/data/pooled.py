@@ -83,10 +83,6 @@ class PooledStore(Episodes):
     def __len__(self) -> int:
         return self._still + len(self.own)
 
-    def open(self, index: int) -> Episode:
-        store, place = self._place(index)
-        return store.open(place)
-
     def read(self, index: int) -> Episode:
         store, place = self._place(index)
         return store.read(place)

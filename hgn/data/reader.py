@@ -1,4 +1,4 @@
-"""Reads published episodes of a data set. Positions are memory-mapped: a window of frames reads only its own pages.
+"""Reads published episodes of a data set. No file is mapped: one that was cut would end the process.
 
 Each shard is checked against the index (size, then sha256) before use. Without this check a tar file that ends too
 early, between two members, would be read as fewer samples. Remote shards come from a cache (`hgn.data.shard_cache`).
@@ -7,12 +7,10 @@ early, between two members, would be read as fewer samples. Remote shards come f
 from __future__ import annotations
 
 import contextlib
-import resource
 import sys
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from heapq import nsmallest
@@ -24,34 +22,26 @@ import numpy as np
 
 from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
-from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import Storage, StorageError, ask, asked_once, faults_outlived, is_remote, open_storage, outliving
+from hgn.data.storage import StorageError, ask, asked_once, faults_outlived, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
 
 T = TypeVar("T")
 AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time until the fault is forgotten
-MAPPED_SHARDS = 256  # largest number of mapped shards; also at most a quarter of the files that a process may open
 
 
 class Episodes(Sequence[Episode], ABC):
     """Defines a sequence of episodes.
 
-    An episode is opened, and its shard verified, on first use. Positions are read-only. `open` maps them into memory.
-    If a mapped file becomes shorter, an access behind its end kills the process. Users may shorten a file in a local
-    folder, so `read` and indexing do not map it. Files in the cache of a URL keep their length and are mapped.
+    A shard is verified when an episode of it is first read. Positions are read-only.
     Raises on access: ConfigError if a shard is missing or altered.
     """
 
     @abstractmethod
-    def open(self, index: int) -> Episode:
-        """Returns the episode at a place from 0, with mapped positions. Use them soon, before the file changes."""
-
-    @abstractmethod
     def read(self, index: int) -> Episode:
-        """Returns the episode at a place from 0. Its positions stay readable."""
+        """Returns the episode at a place from 0."""
 
     @property
     @abstractmethod
@@ -78,7 +68,7 @@ class Episodes(Sequence[Episode], ABC):
 class EpisodeStore(Episodes):
     """Reads the published episodes of one split of a data set, in publication order. Their number only grows.
 
-    For spawned workers it is pickled with folder, split and manifest, but without open files and maps.
+    For spawned workers it is pickled with folder, split and manifest.
     """
 
     _fetcher: threading.Thread | None = None
@@ -255,7 +245,6 @@ class EpisodeStore(Episodes):
         self._reset()
 
     def _reset(self) -> None:
-        self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
         self._scanned: set[str] = set()  # keys of episodes whose positions were checked to be finite
         self._fetcher = None
         self._faulty_since = None
@@ -264,7 +253,6 @@ class EpisodeStore(Episodes):
         self._fetched = 0  # number of shards that _fetch_all has finished with
         self._wanted, self._spared = [], frozenset()
         self._lock = threading.Lock()
-        holders.add(self)
 
     def _bring(self, shard: ShardEntry, use: Callable[[Path], T], **options: Any) -> T:
         """Returns the result of `use` for a shard's verified file. Options and errors as for `Storage.shard`."""
@@ -277,46 +265,13 @@ class EpisodeStore(Episodes):
         """Returns the shards of these episodes in order, each once."""
         return list({shard.name: shard for shard, _ in map(self._locate, indices)}.values())
 
-    def open(self, index: int) -> Episode:
-        shard, entry = self._locate(index)
-        while True:
-            opened = self._open_shards.get(shard.name)
-            if opened is None:  # outside the lock, because a server may answer late
-                opened = self._bring(shard, _OpenShard)
-            with self._lock:
-                opened = self._open_shards.setdefault(shard.name, opened)
-                self._open_shards.move_to_end(shard.name)
-                # each map uses a file descriptor; episodes in use keep theirs
-                if len(self._open_shards) > min(MAPPED_SHARDS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4):
-                    self._open_shards.popitem(last=False)
-                size = opened.size()
-                # removed from a full cache, or shortened: reading after a file's end would kill the process
-                if (size is None and is_remote(self.folder)) or (size is not None and size < shard.bytes):
-                    del self._open_shards[shard.name]
-                    continue
-                if entry.key not in opened.episodes:
-                    opened.episodes[entry.key] = self._read(opened.content, shard, entry)
-                return opened.episodes[entry.key]
-
     def read(self, index: int) -> Episode:
-        if is_remote(self.folder):
-            return self.open(index)
         shard, entry = self._locate(index)
         stop = min(max((offset + size for offset, size in entry.members.values()), default=0), shard.bytes)
         start = max(0, min([stop, *(offset for offset, _ in entry.members.values())]))
-
-        def part(files: Storage) -> bytes:
-            files.shard(shard.name, shard.sha256, shard.bytes)
-            return files.read(shard.name, start, stop)
-
+        content = self._bring(shard, lambda path: open_storage(path.parent).read(path.name, start, stop))
         members = {name: (offset - start, size) for name, (offset, size) in entry.members.items()}
-        return self._read(np.frombuffer(ask(self.folder, part), np.uint8), shard, replace(entry, members=members))
-
-    def release(self, path: Path) -> None:
-        """Closes a shard. Its episodes in use stay readable."""
-        with self._lock:
-            for name in [name for name, opened in self._open_shards.items() if opened.path == path]:
-                del self._open_shards[name]
+        return self._read(np.frombuffer(content, np.uint8), shard, replace(entry, members=members))
 
     def _read(self, content: np.ndarray, shard: ShardEntry, entry: EpisodeEntry) -> Episode:
         scan = entry.key not in self._scanned  # verified bytes may contain positions that are not finite
@@ -339,23 +294,6 @@ class EpisodeStore(Episodes):
                 f"{expected}, and frames must be one of the data set's ({lengths}), got {actual}; {REMEDY}"
             )
         return episode
-
-
-class _OpenShard:
-    """Holds a mapped shard and the episodes that were read from it."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        # an empty file cannot be mapped
-        self.content = np.memmap(path, np.uint8, mode="r") if path.stat().st_size else np.zeros(0, np.uint8)
-        self.episodes: dict[str, Episode] = {}
-
-    def size(self) -> int | None:
-        """Returns the current size of the file, or None if it was removed."""
-        try:
-            return self.path.stat().st_size
-        except FileNotFoundError:
-            return None
 
 
 class FileBytes:

@@ -12,12 +12,10 @@ import os
 import shutil
 import sys
 import time
-import weakref
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from io import BufferedRandom
 from pathlib import Path
-from typing import Protocol
 
 from hgn.data.verification import note_verified, verify_file
 from hgn.schema import ConfigError, require
@@ -30,17 +28,6 @@ CACHE_VARIABLE = "HGN_CACHE"
 LIMIT_VARIABLE = "HGN_CACHE_GB"
 _LOCK_PAUSE_S = 0.05
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-
-
-class Holder(Protocol):
-    """Describes a reader with open files of the cache. Removed files occupy the disk until readers close them."""
-
-    def release(self, path: Path) -> None:
-        """Closes a file that is about to be removed."""
-        ...
-
-
-holders: weakref.WeakSet[Holder] = weakref.WeakSet()
 
 
 def cache_folder() -> Path:
@@ -180,8 +167,6 @@ def _free_space(folder: Path, size: float, spared: Collection[str] | None) -> bo
     for cached, path in _removable(folder, spared):
         if freed >= size:
             break
-        for holder in list(holders):
-            holder.release(path)
         path.unlink(missing_ok=True)
         freed += cached
     return freed > 0

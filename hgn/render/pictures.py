@@ -171,10 +171,7 @@ def rollout_spacing(rollout: Rollout, of_N: np.ndarray | slice = slice(None)) ->
 
 
 def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None) -> Rollout:
-    """Returns an episode as a rollout, or as the ground truth of the given prediction, float32 [T, N, 3].
-
-    The positions of the episode remain memory-mapped.
-    """
+    """Returns an episode as a rollout, or as the ground truth of the given prediction, float32 [T, N, 3]."""
     return Rollout(
         position_TN3=episode.position_TN3 if predicted_TN3 is None else predicted_TN3,
         material_N=np.asarray(episode.material_N),

@@ -1,7 +1,7 @@
 """An episode: one scene's simulated trajectory, as stored in shards and read by the trainer.
 
 Each field is a member of its own (`position.npy`, `material.npy`, ..., `json`). So any WebDataset or tar client can
-read it, and a trainer can memory-map the positions. Pickles are not used.
+read it. Pickles are not used.
 Shape legend: T frames, N particles, K obstacle cells, H frames before frame 0, P particles of obstacles.
 """
 
@@ -54,7 +54,7 @@ class Episode:
     """A trajectory. Frame 0 is the initial state, so T frames are T - 1 steps of 1 / frame_rate_hz seconds.
 
     Raises: ConfigError for a wrong shape, type or value. `encode_episode` and `decode_episode` check that positions
-    are finite; the class does not, because positions may be a memory map of a verified file.
+    are finite; the class does not, because that takes long and verified files need it once.
     """
 
     key: str  # sample name inside the data set, without dots: train-000012
@@ -212,7 +212,7 @@ def encode_episode(episode: Episode) -> dict[str, tuple[bytes | memoryview, ...]
 def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_positions: bool = True) -> Episode:
     """Decodes the members of `encode_episode`.
 
-    Members are bytes or flat uint8 arrays. Arrays are views of the members, so a slice of a memory map stays one.
+    Members are bytes or flat uint8 arrays. Arrays are views of the members.
     `scan_positions=False` skips the check for finite positions, for verified bytes.
     Raises: ConfigError for a missing or unknown member, another schema version, a wrong shape, type or value.
     """
@@ -303,8 +303,8 @@ def require_schema_version(mapping: object, name: str) -> None:
 
 
 def _require_sound_positions(episode: Episode) -> None:
-    # A block at a time, so that a memory map is not loaded completely. With a call per frame, threads that check
-    # episodes would delay each other, because each call waits for the interpreter's lock.
+    # A block at a time, which fits into a core's cache. With a call per frame, threads that check episodes would delay
+    # each other, because each call waits for the interpreter's lock.
     position_TN3, farthest = np.asarray(episode.position_TN3), _FARTHEST * max(episode.domain_size)
     frames = max(1, _BLOCK_PARTICLES // max(episode.particle_count, 1))
     for first in range(0, episode.frame_count, frames):

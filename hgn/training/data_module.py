@@ -52,7 +52,7 @@ class EpisodeDataModule(LightningDataModule):
         self.waited_s = 0.0  # time that the training has waited for a chunk
 
     def train_dataloader(self) -> DataLoader[WindowChunk | EpisodeChunk]:
-        # The windows are memory-mapped and small, so a worker process would cost more than it saves.
+        # Episodes are read within milliseconds, so a worker process would cost more than it saves.
         return DataLoader(_Stream(self), batch_size=None, num_workers=0)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:

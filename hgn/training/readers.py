@@ -4,6 +4,7 @@ import sys
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple, Protocol
 
@@ -19,6 +20,7 @@ from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import Starts, simulated_barrier
 
+REMEMBERED_SCENES = 1024  # number of episodes whose rest shapes stay in memory
 READERS = 8  # number of threads that copy whole episodes
 
 
@@ -80,6 +82,8 @@ class WindowReader:
         self._store, self._network = store, network
         self._simulates = training.pushforward_fraction > 0
         self._draws = FrameDraws(store, training)
+        # episodes with frame 0 only, oldest first: they keep rest shapes and the fields of their obstacles
+        self._scenes: OrderedDict[int, Episode] = OrderedDict()
 
     def read(self, drawn: DrawnChunk) -> WindowChunk:
         (update,) = drawn.samples
@@ -89,10 +93,15 @@ class WindowReader:
         return WindowChunk((samples,), drawn.sampler_state, starts, batch)
 
     def _sample(self, sample: Sample) -> BatchSample:
-        episode = self._store.open(sample.episode)
+        episode = self._store.read(sample.episode)
         window_WN3 = window(episode, sample.frame, self._network.velocity_history)
+        if sample.episode not in self._scenes:
+            self._scenes[sample.episode] = replace(episode, position_TN3=episode.position_TN3[:1].copy())
+            if len(self._scenes) > REMEMBERED_SCENES:
+                self._scenes.popitem(last=False)
+        scene = self._scenes[sample.episode]
         return BatchSample(
-            episode, sample.frame, window_WN3, seed=sample.seed, weight=sample.weight, noise_scale=sample.noise_scale
+            scene, sample.frame, window_WN3, seed=sample.seed, weight=sample.weight, noise_scale=sample.noise_scale
         )
 
 

@@ -183,14 +183,3 @@ def test_index_that_was_altered(folder, pattern, text, message):
         return
     with pytest.raises(ConfigError, match=message):
         store[0]
-
-
-def test_maps_are_bounded(folder, monkeypatch):
-    """Many shards need few open files; one that is cut while it is mapped is an error, not the end of the process."""
-    monkeypatch.setattr(hgn.data.reader, "MAPPED_SHARDS", 2)
-    store = EpisodeStore(folder, "train")
-    assert [store.open(i).key for _ in range(2) for i in range(5)] == [f"train-{i:06d}" for i in range(5)] * 2
-    assert len(store._open_shards) == 2
-    os.truncate(folder / "train-000004-000005.tar", 1000)
-    with pytest.raises(ConfigError, match=r"000005\.tar must have 10240 bytes, got 1000; delete it and run"):
-        store.open(4)

@@ -294,10 +294,9 @@ def test_nothing_is_lost(tmp_path, backend, name, every):
     assert faults == [] and failed > 1
 
 
-def test_a_mapped_shard_never_shrinks(tmp_path, backend):
-    """A shard, cached or not, gets its name when it is complete and is never written to or truncated afterwards, so
-    that mapping it is safe (a truncated map would end the reader with SIGBUS). Its name is on the disk when a manifest
-    lists it, even for a moment."""
+def test_a_shard_never_shrinks(tmp_path, backend):
+    """A shard, cached or not, gets its name when it is complete and is never written to or truncated afterwards. Its
+    name is on the disk when a manifest lists it, even for a moment."""
     data, counts = tmp_path / "disk" / "data", set()
 
     def before():

@@ -1,4 +1,4 @@
-"""Reading published episodes: memory-mapped, verified, and growing with the data set."""
+"""Reading published episodes: verified, and growing with the data set."""
 
 import dataclasses
 import hashlib
@@ -20,15 +20,13 @@ from hgn.data.verification import file_sha256, verify_file
 from hgn.schema import ConfigError
 
 
-def test_positions_are_read_only_memory_maps(folder):
-    """Positions of opened episodes stay on disk until used; everything else is loaded."""
+def test_positions_are_read_only(folder):
+    """Episodes come in their order, by place and by slice, with the sizes that the index has."""
     store = EpisodeStore(folder, "train")
     assert len(store) == 5 and [entry.key for entry in store.entries] == [f"train-{i:06d}" for i in range(5)]
-    for episode, entry in zip(map(store.open, range(5)), store.entries, strict=True):
-        assert isinstance(episode.position_TN3, np.memmap) and not episode.position_TN3.flags.writeable
-        assert not isinstance(episode.material_N, np.memmap)
+    for episode, entry in zip(store, store.entries, strict=True):
+        assert not episode.position_TN3.flags.writeable
         assert episode.position_TN3.shape == (entry.frames, entry.particles, 3) and episode.seed == entry.seed
-        assert episode.position_TN3.ctypes.data % 64 == 0
     assert store[-1].key == "train-000004"
     assert [episode.key for episode in store[1:3]] == ["train-000001", "train-000002"]
     with pytest.raises(IndexError):
@@ -36,7 +34,7 @@ def test_positions_are_read_only_memory_maps(folder):
 
 
 def test_a_shard_of_no_bytes(tmp_path):
-    """A manifest that lists an empty file is refused with a message: there is no map of nothing."""
+    """A manifest that lists an empty file is refused with a message."""
     empty = dataclasses.replace(shard(0), sha256=hashlib.sha256().hexdigest(), bytes=0)
     Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([empty])).save(tmp_path)
     (tmp_path / empty.name).touch()
@@ -45,11 +43,9 @@ def test_a_shard_of_no_bytes(tmp_path):
 
 
 def test_store_travels_to_workers(folder):
-    """A shard is mapped once: a thousand episodes do not need a thousand open files. A pickled store holds no episode
-    data and opens the same episodes on the other side."""
+    """A pickled store holds no episode data and opens the same episodes on the other side."""
     store = EpisodeStore(folder, "train")
-    _ = [store.open(place) for place in range(len(store))]
-    assert len(store._open_shards) == store.manifest.totals["train"].shards == 4 and store.open(2) is store.open(2)
+    assert len(store[:]) == 5
     data = pickle.dumps(store)
     assert len(data) < 20_000
     assert np.array_equal(pickle.loads(data)[3].position_TN3, store[3].position_TN3)
@@ -62,11 +58,11 @@ def test_store_grows_with_the_dataset(make_config, make_dataset):
         assert EpisodeStore.available(writer.folder) and len(EpisodeStore(writer.folder, "train")) == 0
     folder = make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
     train, test = EpisodeStore(folder, "train"), EpisodeStore(folder, "test")
-    first = train.open(0)
+    first = train[0].position_TN3
     assert not train.refresh() and train.frames() == [6, 6, 9]
     make_dataset(make_config(training_scenes=9, long_fraction=0.4, long_frames=9))
     assert train.refresh() and not test.refresh() and train.frames(4) == [6, 6, 9, 6]
-    assert len(train) == 9 and train.open(0) is first
+    assert len(train) == 9 and np.array_equal(train[0].position_TN3, first)
     assert train.frames() == [episode.frame_count for episode in train] and 9 in train.frames()[3:]
     assert train.manifest.revision == Manifest.load(folder).revision
     assert train.statistics() == Manifest.load(folder).statistics("train")

@@ -59,7 +59,7 @@ def test_roundtrip(frames, particles, cells, seed):
 
 def test_members():
     """Memory layout and key order of the input leave no trace in the stored bytes, and NumPy and JSON alone read them.
-    Members given as arrays are not copied, so that a memory map stays one."""
+    Members given as arrays are not copied."""
     episode = make_episode()
     members, solver = members_of(episode), dict(reversed(episode.solver.items()))
     other = dataclasses.replace(episode, position_TN3=np.asfortranarray(episode.position_TN3), solver=solver)

@@ -110,25 +110,24 @@ def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, 
     make_dataset(make_config())
     files = fsspec.filesystem("memory")
     files.put(str(tmp_path / "data"), "/leaving", recursive=True)
-    real, opened, asked = EpisodeStore.open, [], []
+    real, opened, asked = EpisodeStore.read, [], []
 
     def gone(*arguments, **options):
         asked.append(1)
         os.kill(os.getpid(), signal.SIGTERM)
         raise ConnectionResetError("gone")
 
-    def open_episode(store, index):
+    def read_episode(store, index):
         opened.append(index)
         if len(opened) == 12:
             files.cat_file = gone
-            store._open_shards.clear()
             for shard in cache.rglob("*.tar"):
                 shard.unlink()
         return real(store, index)
 
     config = make_config(folder="memory://leaving")
     monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store: None)
-    monkeypatch.setattr(EpisodeStore, "open", open_episode)
+    monkeypatch.setattr(EpisodeStore, "read", read_episode)
     try:
         assert train.main(train_mapping(config, tmp_path / "run", monitor_every=100)) == 128 + signal.SIGTERM
     finally:

@@ -14,7 +14,6 @@ import threading
 from pathlib import Path
 from unittest import mock
 
-import numpy as np
 import pytest
 from data.test_http import Quiet, answering
 from training.runs import metrics, train_mapping
@@ -25,6 +24,7 @@ from hgn.config import TrainConfig
 from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError, from_mapping
+from hgn.system.files import open_at_once
 from hgn.system.locks import locked
 from hgn.system.patience import VARIABLE, outlived, without_patience
 from hgn.training import callbacks, checkpoint_writer, monitor
@@ -166,7 +166,7 @@ AWAY = {
     "folder": lambda _: renamed("."),
     "cut": lambda shard: written(lambda before: before[:700], shard),
     "altered": lambda shard: written(lambda before: before[:-1] + b"?", shard),
-    "map": lambda _: lambda folder: mock.patch("numpy.memmap", failing_at_first(np.memmap)),
+    "read": lambda _: lambda folder: mock.patch("hgn.data.storage.open_at_once", failing_at_first(open_at_once)),
     **{f"index of {line!r}": lambda _, line=line: of_the_index(lines_of(line)) for line in (b"{}", b"5", b"null")},
     "index of others": lambda _: of_the_index(functools.partial(re.sub, rb"[0-9a-f]{64}", 64 * b"0")),
     "index in another order": lambda _: of_the_index(lambda before: b"".join(before.splitlines(True)[::-1])),
@@ -177,7 +177,7 @@ AWAY = {
 @pytest.mark.parametrize("opened", [False, True, "evaluate", "rollout"])
 @pytest.mark.parametrize("away", AWAY)
 def test_files_that_are_away_for_a_moment(data, away, opened, monkeypatch):
-    """Reading an episode, or lines of the index, waits for what is renamed, cut or altered, or cannot be mapped: in a
+    """Reading an episode, or lines of the index, waits for what is renamed, cut or altered, or cannot be opened: in a
     training, and as evaluations and rollouts read."""
     folder = Path(data.dataset.folder).resolve()
     store = EpisodeStore(folder, "train")
