@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_022,
+    "hgn": 34_028,
     "datagen": 8_948,
     "tools": 6_349,
-    "tests": 34_576,
+    "tests": 34_603,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from hgn.config import NetworkConfig, config_directory
@@ -118,9 +118,9 @@ def load_weights(
         remedy = remedy if path.is_dir() else near_file(path) or "write one with python -m hgn.export"
         raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
     try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            metadata = file.metadata() or {}
-        tensors = load(path.read_bytes())  # `file` would map them, and end the process if another one cut the file
+        data = path.read_bytes()  # not mapped: a file that another program cut would end the process
+        tensors = load(data)
+        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         remedy = f"python -m hgn.export checkpoint={path} out=…" if path.suffix == ".ckpt" else "export it again"
         raise ConfigError(

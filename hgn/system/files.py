@@ -4,7 +4,6 @@ import contextlib
 import errno
 import io
 import json
-import mmap
 import os
 import re
 import secrets
@@ -18,8 +17,9 @@ _LOST_AT_MOST = 10  # number of retries
 WRITTEN_BY_HGN = "written by HGN"  # the mark of files without other metadata
 # matches all files that the commands write: reports begin with their provenance, binary files have metadata named hgn
 _WRITTEN_BY_HGN = re.compile(
-    rb'written by HGN|hgn rollout|"hgn"|\x03hgn\x12|\A\{\s*"meta": \{|^provenance:$', re.MULTILINE
+    rb'written by HGN|hgn rollout|"hgn"|\x03hgn\x12|\A\{\s*"meta": \{|^provenance:\n', re.MULTILINE
 )
+LONGEST_MARK, BLOCK_BYTES = 32, 1 << 24
 
 
 def temporary_target(path: Path) -> str:
@@ -108,8 +108,14 @@ def is_replaceable(path: Path) -> bool:
     """Returns whether writing `path` loses no file of another program, and no device, which a rename would replace."""
     if not path.is_file() or not path.stat().st_size:
         return path.is_file() or path.is_dir() or not path.exists()
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        return _WRITTEN_BY_HGN.search(content) is not None
+    content = b""
+    with path.open("rb") as file:
+        while block := file.read(BLOCK_BYTES):  # not mapped: a file that was cut would end the process
+            content = content[-LONGEST_MARK:] + block
+            # from 1 on, because marks of the file's start do not count at the start of a later block
+            if _WRITTEN_BY_HGN.search(content, int(len(content) > len(block))):
+                return True
+    return False
 
 
 @contextlib.contextmanager
