@@ -7,7 +7,7 @@ import pytest
 from mpm_scenes import CELL, CONFIG, particles, sheet, simulated
 
 from datagen.mpm.solver import simulate
-from hgn.scene.emission import Face, entry_frames
+from hgn.scene.emission import Face, at_start, entry_frames
 from hgn.scene.material import MATERIALS, SNOW, WATER
 from hgn.schema import ConfigError
 
@@ -73,3 +73,18 @@ def test_entry_frames():
     """A particle is seen first in the frame at its time of entry or after it; those of the start in frame 0."""
     scene = particles(np.full((4, 3), 0.5), entry_s_N=np.array([0.0, 0.001, 1 / 60, 0.02]))
     assert entry_frames(scene, 60.0).tolist() == [0, 1, 1, 2]
+
+
+def test_selected_particles_keep_what_is_theirs():
+    """Also the material's constants and the time of entry; without emitters a scene starts as it is."""
+    given = particles(np.full((4, 3), 4.5 * CELL), WATER)
+    constants = {"water_viscosity_pa_s": np.arange(4, dtype=np.float32)}
+    scene = dataclasses.replace(given, material_parameters=constants, entry_s_N=np.array([0.0, 0.0, 0.1, 0.2]))
+    assert at_start(given) is given
+    for chosen, kept in ((np.array([False, True, True, False]), [1, 2]), (slice(2), [0, 1]), ([0, 0, 3], [0, 0, 3])):
+        own = scene.selected(np.array(chosen) if isinstance(chosen, list) else chosen)
+        assert own.particle_count == len(own.velocity_N3) == len(own.material_N) == len(kept)
+        assert own.material_parameters["water_viscosity_pa_s"].tolist() == kept
+        assert own.entry_s_N.tolist() == scene.entry_s_N[kept].tolist()
+    first = at_start(scene)
+    assert first.entry_s_N is None and first.material_parameters["water_viscosity_pa_s"].tolist() == [0, 1]
