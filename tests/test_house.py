@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_028,
-    "datagen": 8_948,
+    "datagen": 8_939,
     "tools": 6_349,
-    "tests": 34_603,
+    "tests": 34_618,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

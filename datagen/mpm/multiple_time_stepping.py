@@ -15,18 +15,10 @@ import taichi as ti
 
 from datagen.mpm.constitutive import foreseen_stiffness
 from datagen.mpm.layout import COUNT, SETTING, SHAPE, VALUE
-from datagen.mpm.nodes import base_node
+from datagen.mpm.nodes import base_node, corner_block
 
 MANY = 32  # largest number of substeps in a particle's own step; also the base of the marks
 SLACK = 1e-3  # times that differ by less than this fraction of a substep count as equal
-
-
-@ti.func
-def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Returns the index of corner n (0 to 7) of the blocks `first` to `last` that contain a particle's nodes."""
-    corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
-    index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-    return index + scene * shape[SHAPE.scene_blocks]
 
 
 @ti.func
@@ -36,7 +28,7 @@ def _raise_marks(base, least: ti.i32, scene: ti.i32, arrays: ti.template(), begi
     `base` is the lowest of the particle's 3³ nodes.
     """
     first, last = base >> 2, (base + 2) >> 2
-    index = ti.Vector([begin + _corner_block(first, last, n, scene, arrays.shape) for n in range(8)])
+    index = ti.Vector([begin + corner_block(first, last, n, scene, arrays.shape) for n in range(8)])
     found = ti.Vector([arrays.block[index[n]] for n in range(8)])  # loads are issued together to hide the latency
     for n in ti.static(range(8)):
         own = found[n] < least
@@ -81,7 +73,7 @@ def _alike_around(
     fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
     alike = 1
     for n in ti.static(range(8)):
-        index = former + _corner_block(base >> 2, (base + 2) >> 2, n, scene, arrays.shape)
+        index = former + corner_block(base >> 2, (base + 2) >> 2, n, scene, arrays.shape)
         if (arrays.block[index] != fewest - MANY) | (arrays.block[index + blocks] != most - MANY):
             alike = 0
     _raise_marks(base, fewest, scene, arrays, present)

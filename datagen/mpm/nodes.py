@@ -35,6 +35,14 @@ def base_node(x, inverse_dx: ti.f32):
 
 
 @ti.func
+def corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
+    """Returns the index of corner n (0 to 7) of the blocks `first` to `last` that contain a particle's nodes."""
+    corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
+    index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
+    return index + scene * shape[SHAPE.scene_blocks]
+
+
+@ti.func
 def mark(
     x, scene: ti.i32, inverse_dx: ti.f32, arrays: ti.template(), list_begin: ti.i32, length: ti.template(),
     length_at: ti.i32,
@@ -48,15 +56,7 @@ def mark(
     base = base_node(x, inverse_dx)
     first = base >> 2
     last = (base + 2) >> 2
-    corner = ti.Matrix([[last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)] for n in range(8)])
-    index = ti.Vector(
-        [
-            scene * arrays.shape[SHAPE.scene_blocks]
-            + (corner[n, 0] * arrays.shape[SHAPE.blocks + 1] + corner[n, 1]) * arrays.shape[SHAPE.blocks + 2]
-            + corner[n, 2]
-            for n in range(8)
-        ]
-    )
+    index = ti.Vector([corner_block(first, last, n, scene, arrays.shape) for n in range(8)])
     flag = ti.Vector([arrays.block[index[n]] for n in range(8)])  # loads are issued together to hide the latency
     for n in ti.static(range(8)):
         fresh = flag[n] == 0
@@ -67,9 +67,8 @@ def mark(
             if ti.atomic_max(arrays.block[index[n]], 1) == 0:
                 entry = list_begin + ti.atomic_add(length[length_at], 1)
                 arrays.block[entry] = index[n]
-                arrays.block[entry + arrays.shape[SHAPE.all_blocks]] = (
-                    (corner[n, 0] << 20) | (corner[n, 1] << 10) | corner[n, 2]
-                )
+                corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
+                arrays.block[entry + arrays.shape[SHAPE.all_blocks]] = (corner[0] << 20) | (corner[1] << 10) | corner[2]
 
 
 @ti.func
