@@ -88,7 +88,7 @@ class InitialState:
             obstacle_grid=episode.obstacle_grid,
             domain_size=episode.domain_size,
             gravity=episode.gravity,
-            corners=lambda: all_corners(at_rest(known_obstacles(episode) or ())),
+            corners=lambda: all_corners(at_rest(known_obstacles(episode.specification) or ())),
             materials=episode.materials,
             past_HN3=episode.past_HN3,
             dimensions=episode.dimensions,

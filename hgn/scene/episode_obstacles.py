@@ -25,21 +25,17 @@ from hgn.schema import Vector
 
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
     """Returns the meshes of an episode's obstacles. If only cells are known, returns a square for each cell."""
-    meshes = known_obstacles(episode)
+    meshes = known_obstacles(episode.specification)
     if meshes is None:
         return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
     return meshes
 
 
-def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
+def known_obstacles(specification: Mapping[str, Any]) -> tuple[Obstacle, ...] | None:
     """Returns the meshes of an episode's obstacles or None. Shards do not contain them.
 
     A random scene's meshes are rebuilt from its specification. Other scenes, or a missing mesh file, give none.
     """
-    return _known(episode.specification)
-
-
-def _known(specification: Mapping[str, Any]) -> tuple[Obstacle, ...] | None:
     records = specification.get("obstacles", ())
     if specification.get("kind") != "random" or not all(_is_here(record) for record in records):
         return None
@@ -72,7 +68,7 @@ def field_of_episode(episode: Episode) -> ObstacleGrid:
 @lru_cache(maxsize=256)
 def _field(grid: ObstacleGrid, specification: str, domain_size: Vector) -> ObstacleGrid:
     """Does not take the episode, because the cache would keep its positions in memory."""
-    still = [obstacle for obstacle in _known(json.loads(specification)) or () if obstacle.motion is None]
+    still = [obstacle for obstacle in known_obstacles(json.loads(specification)) or () if obstacle.motion is None]
     return field_around(grid, all_corners(still), domain_size)
 
 

@@ -17,6 +17,7 @@ N particles, S scenes.
 """
 
 import functools
+import json
 import time
 from collections.abc import Sequence
 from typing import Generic, Protocol, TypeVar
@@ -27,10 +28,12 @@ import torch
 from hgn.config import SIMULATED_FRAMES, TrainingConfig
 from hgn.data.importance import DrawnBySize
 from hgn.runtime.divergence import diverged
-from hgn.runtime.simulator import InitialState
-from hgn.scene.barrier import Barrier
+from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError
+from hgn.scene.episode_obstacles import known_obstacles
+from hgn.scene.moving import at_rest
+from hgn.scene.scene import all_corners
+from hgn.schema import ConfigError, Vector
 from hgn.training.noise import noise_scale, target_acceleration
 
 E = TypeVar("E")  # an episode as a backend reads it
@@ -135,14 +138,21 @@ def usable_frames(
     return count, square_F[(count - 1).clamp(min=0)]
 
 
-@functools.lru_cache(maxsize=256)
 def simulated_barrier(episode: Episode, clearance: float) -> Barrier:
     """Returns the barrier of an episode's obstacles; it is empty if only the obstacles' cells are stored.
 
     The last barriers are cached: a large mesh takes 0.1 s or more.
     Raises: ConfigError for a clearance of more than a cell.
     """
-    return InitialState.of_episode(episode).barrier(clearance)
+    specification, cell_size = json.dumps(episode.specification), episode.obstacle_grid.cell_size
+    return _barrier(specification, cell_size, clearance, tuple(episode.domain_size))
+
+
+@functools.lru_cache(maxsize=256)
+def _barrier(specification: str, cell_size: float, clearance: float, domain_size: Vector) -> Barrier:
+    """Does not take the episode, because the cache would keep its positions in memory."""
+    corner_F33 = all_corners(at_rest(known_obstacles(json.loads(specification)) or ()))
+    return build_barrier(corner_F33, cell_size, clearance, domain_size)
 
 
 class SimulatedScenes(Protocol[E, T]):

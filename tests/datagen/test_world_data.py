@@ -33,7 +33,7 @@ def test_one_batch_has_scenes_of_several_domains():
         scene = one.scene.open()
         assert np.abs(episode.position_TN3[0] - scene.position_N3).max() < 1e-6
         assert episode.domain_size == scene.domain_size and episode.gravity == scene.gravity
-        meshes = known_obstacles(episode)
+        meshes = known_obstacles(episode.specification)
         assert [mesh.vertex_V3.tolist() for mesh in meshes] == [mesh.vertex_V3.tolist() for mesh in scene.obstacles]
 
 

@@ -1,5 +1,7 @@
 """Pushforward on backend torch."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +13,11 @@ from training.test_symmetry import scene_with_obstacles
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, join, make_batch
-from hgn.runtime import simulator
 from hgn.runtime.simulator import Simulator
 from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.step_config import StepConfig
+from hgn.training import pushforward
 from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts, pushforward_windows
 from hgn.training.torch_pushforward import TorchScenes
 
@@ -200,17 +202,22 @@ def with_square(episode, at, size=0.6):
 
 def test_barriers_are_remembered(monkeypatch):
     """The pool is made anew, from other frames of the same episodes, without their obstacles' lists being built again;
-    another clearance has its own."""
-    built = []
-    real = simulator.build_barrier
-    monkeypatch.setattr(simulator, "build_barrier", lambda *given: built.append(given[2]) or real(*given))
-    scenes = [with_square(episode(8, seed=seed), (0.5, 0.53, 0.5)) for seed in (1, 2)]
+    another clearance has its own. Episodes are read again each time, and no earlier one stays in memory."""
+    built, real = [], pushforward.build_barrier
+    monkeypatch.setattr(pushforward, "build_barrier", lambda *given: built.append(given[2]) or real(*given))
+    scenes = [with_square(episode(8, seed=seed), (0.5, 0.53 + seed / 1000, 0.5)) for seed in (1, 2)]
     network = wild_network()
     for clearance in (2e-3, 1e-3):
         network.step = StepConfig(obstacle_clearance=clearance)
         own = pool_of(network)
         for frame in (2, 3, 4):
+            read = [replace(scene) for scene in scenes]
+            own.refresh([(scene, frame) for scene in read])
+            first, _ = map(weakref.ref, read)
             own.refresh([(scene, frame) for scene in scenes])
+            del read
+            gc.collect()
+            assert first() is None
     assert built == [2e-3, 2e-3, 1e-3, 1e-3]
 
 
