@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_034,
+    "hgn": 34_040,
     "datagen": 8_939,
     "tools": 6_349,
-    "tests": 34_625,
+    "tests": 34_648,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from hgn.config import MpmConfig, SceneConfig
-from hgn.scene.kinds import FASTEST
+from hgn.scene.kinds import ELASTIC_KINDS, FASTEST
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.scene import Scene
 
 ORDINARY = 1 / 2  # fraction of scenes without friction and with the defaults of all parameters
 ALONE = 1 / 3  # of the others: fraction with friction only, and with parameters only
 ELASTIC = 1 / 6  # fraction of scenes with elastic bodies, half of them without other materials
-ELASTIC_KINDS = ("obstacles", "motion", "collision", "drop", "slope", "edge", "stack", "apart", "bowl", "stairs", "jet")
 _STREAM, _ELASTIC_STREAM = 6, 7  # keys of random streams; the scene's other numbers do not depend on them
 NOMINAL_P = tuple(float(getattr(MpmConfig(), name)) for name in INPUT_PARAMETERS)
 

@@ -14,7 +14,7 @@ import numpy as np
 from hgn.config import SceneConfig
 from hgn.scene.funnel import Quaternion
 from hgn.scene.group import WALL_CELLS, Region, particle_count, points_in_ball, random_direction, region_of
-from hgn.scene.kinds import MAXIMUM_PARTICLES, MOVING_FRACTION, MOVING_RANGES, RANGES
+from hgn.scene.kinds import ELASTIC_KINDS, MAXIMUM_PARTICLES, MOVING_FRACTION, MOVING_RANGES, RANGES
 from hgn.scene.motion import Keyframes, Motion
 from hgn.scene.placement import ROUNDING, Body, Placed, blocked, choice, filled, place_shape
 from hgn.schema import ConfigError, Vector, triple
@@ -24,6 +24,7 @@ NEAREST_CELLS = 1.0  # smallest distance between obstacles and bodies, in solver
 NEAR_WALL = 0.08  # largest gap between a wall and a body that is placed next to it
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
+_MOVING_STREAM = 8  # key of a random stream. With 7, that of elastic bodies, all moving scenes would be elastic.
 
 # Edge lengths in cells of 1/64.
 DOMAINS: dict[str, tuple[int, int, int]] = {
@@ -351,11 +352,11 @@ def _paddle(new: Layout) -> None:
 
 
 def _piston(new: Layout) -> None:
-    """Presses a body on the floor together with a plate from above."""
+    """Presses a body on the floor together with a plate from above, elastic bodies by half as much as others."""
     new.take_domain("room", "small", "tray")
     size, gap = new("size"), new("gap")
     x, z, top = new.along(0, 0.5 * size), new.along(2, 0.5 * size), new.low + size
-    way = gap + new("way") * size
+    way = gap + new("way") * size * (0.5 if "elastic" in new.config.materials else 1.0)
     middle = (x, top + NEAREST_CELLS * new.config.cell_size + gap, z)
     new.place("square", 1.5 * size + 0.15, middle, UNTURNED, _motion(new, (0.0, -way, 0.0)))
     new.body(size, (x, new.low + 0.5 * size + ROUNDING, z), material="snow" if new.chance(0.4) else "")
@@ -430,8 +431,9 @@ def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConf
     rng = np.random.Generator(np.random.PCG64([seed, 5]))
     kind = draw_kind(config.kinds, rng)
     if "moving" in config.own_physics:
-        own = np.random.Generator(np.random.PCG64([seed, 7]))
-        kind, rng = (choice(tuple(MOVING_RANGES), own), own) if own.random() < MOVING_FRACTION else (kind, rng)
+        own = np.random.Generator(np.random.PCG64([seed, _MOVING_STREAM]))
+        possible = tuple(k for k in MOVING_RANGES if k in ELASTIC_KINDS or "elastic" not in config.materials)
+        kind, rng = (choice(possible, own), own) if own.random() < MOVING_FRACTION else (kind, rng)
     for _ in range(DRAWS):
         new = Layout(config, kind, rng)
         try:

@@ -5,6 +5,7 @@ import hashlib
 import json
 from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hgn.config import DatagenConfig, SceneConfig
 from hgn.data.identity import dataset_identity
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS
-from hgn.scene.kinds import SCENE_KINDS, fastest
+from hgn.scene.kinds import ELASTIC_KINDS, MOVING_RANGES, SCENE_KINDS, fastest
 from hgn.scene.own_physics import with_elastic_bodies
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rotation import quaternion_rotation
@@ -178,6 +179,28 @@ def test_a_sixth_of_the_scenes_draws_elastic_bodies():
     }
     seed = next(seed for seed in range(600) if seed not in drawn)
     assert digest(generate_scene(config, seed)) == digest(generate_scene(plain, seed))
+
+
+def test_what_scenes_draw_of_own_physics_is_independent():
+    """Each of friction, parameters, elastic bodies and moving obstacles with each other, within four deviations of the
+    product of their fractions; but friction and parameters, of which half of the scenes have neither."""
+    physics = ("friction", "parameters", "elastic", "moving")
+    kinds = {"drop": 1.0, "apart": 1.0}
+    config = SceneConfig(domain_size=LARGEST, kinds=kinds, particles_per_cell=0.1, own_physics=physics)
+    scenes = [generate_scene(config, seed) for seed in range(500)]
+    has = {
+        "friction": [any(s.wall_friction) for s in scenes],
+        "parameters": [bool(s.material_parameters) for s in scenes],
+        "elastic": [with_elastic_bodies(config, seed) is not config for seed in range(500)],
+        "moving": [s.specification["layout"] in MOVING_RANGES for s in scenes],
+    }
+    for one, other in combinations(physics, 2):
+        if {one, other} != {"friction", "parameters"}:
+            expected = sum(has[one]) * sum(has[other]) / 500
+            both = sum(map(min, has[one], has[other]))
+            assert abs(both - expected) < 4 * np.sqrt(expected), (one, other, both, expected)
+    elastic = {s.specification["layout"] for s, own in zip(scenes, has["elastic"], strict=True) if own}
+    assert elastic <= set(ELASTIC_KINDS) and len(elastic) > 3
 
 
 def test_half_of_the_scenes_draws_friction_or_parameters():

@@ -41,7 +41,7 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     monkeypatch.setattr(ballistic_solver, "build_obstacle_grid", grid)
     kinds = {"slope": 2.0, "column": 1.0}
     scene = SceneConfig(domain_size=(2.0, 1.5, 1.5), kinds=kinds, own_physics=OWN, particles_per_cell=0.2)
-    config = replace(make_config(training_scenes=12), scene=scene)
+    config = replace(make_config(training_scenes=12, seed=1), scene=scene)
     store = EpisodeStore(make_dataset(config), "train")
     episodes = [store[i] for i in range(12)]
     rough = [any(episode.wall_friction) for episode in episodes]
