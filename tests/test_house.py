@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 34_040,
     "datagen": 8_939,
-    "tools": 6_349,
+    "tools": 6_354,
     "tests": 34_648,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config

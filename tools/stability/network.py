@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, MpmConfig, SceneConfig, SimulatorConfig
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
@@ -133,3 +134,7 @@ class Runner:
                 trials = solver_trials(list(pending.values()), self.mpm, frames, self.simulator.frame_rate_hz)
                 self._solved |= dict(zip(pending, trials, strict=True))
         return [self._solved[id(scene)] for scene in scenes]
+
+
+if __name__ == "__main__":
+    run_command(main, "stability_network")
