@@ -19,7 +19,7 @@ from hgn.data.manifest import SPLITS, Manifest, errors_in_config
 from hgn.data.storage import is_remote
 from hgn.scene.kinds import RANGES
 from hgn.scene.own_physics import own_ranges
-from hgn.schema import from_mapping, require
+from hgn.schema import from_mapping, printable, require
 from hgn.system.files import read_replaced, write_atomically
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def _range_rows(ranges: Mapping[str, tuple[float, float]]) -> dict[str, str]:
 
 def _plain(text: str) -> str:
     """Returns a text with all special characters escaped for Markdown."""
-    return re.sub(r"[^\w .,;:%/'()+-]", lambda match: f"&#{ord(match[0])};", text)
+    return re.sub(r"[^\w .,;:%/'()+-]", lambda match: f"&#{ord(match[0])};", printable(text))
 
 
 def _vector(value: Sequence[float]) -> str:

@@ -26,8 +26,10 @@ from hgn.renamed import current_names, removed_remedy
 from hgn.system.files import is_replaceable
 
 T = TypeVar("T")
-# control characters of terminals and text direction, and surrogates, except those that stand for bytes of file names
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]")
+# control characters of terminals, text direction and lines; surrogates, except those for bytes of file names
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]"
+)
 # Passwords may have spaces, slashes and @. They end at the last @ before a space. Digits before a space are a port,
 # unless a single word with @ follows. Digits before a slash are a port, and the rest is a path.
 _MOST = "{1,2000}"

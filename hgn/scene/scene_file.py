@@ -38,6 +38,7 @@ from hgn.schema import (
     from_mapping,
     known_keys,
     near_file,
+    printable,
     require,
     require_bounds,
     to_mapping,
@@ -299,7 +300,7 @@ def notes_on_files(scene: Scene) -> list[str]:
             notes.append(f"no surface in the domain: {name}; see {key} and position{unit}")
         elif np.ptp(begin.vertex_V3, axis=0).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name}; see {key}")
-    return notes
+    return [printable(note) for note in notes]
 
 
 def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
