@@ -296,12 +296,9 @@ class NetworkConfig:
     # additional inputs (hgn.network.own_physics): friction of surfaces, parameters of the materials, the deformation of
     # elastic bodies, and the motion of obstacles
     own_physics: OwnPhysics = ()
-    coulomb_friction: bool = False  # friction begins with the law of sliding (hgn.network.own_physics)
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        has = "friction" in self.own_physics or not self.coulomb_friction
-        require(has, "coulomb_friction", "false without friction in own_physics", True)
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
         rule = "an empty list with inputs=absolute"
         require(self.relative or not self.own_physics, "own_physics", rule, list(self.own_physics))

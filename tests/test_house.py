@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_043,
+    "hgn": 33_962,
     "datagen": 8_939,
     "tools": 6_354,
-    "tests": 34_698,
+    "tests": 34_675,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

@@ -20,8 +20,6 @@ b is the largest number for which f = b c Q T, with c = d_C t_C, satisfies f . (
 along surfaces after a frame without friction, Q (v + g + d_C A_C), and D the variance of v in the cell, in units of
 s_a. Reason: friction changes the velocity of each particle by -l u_p, 0 <= l <= 1, so by a vector in the ball around
 -u_p / 2 with the radius |u_p| / 2. So the mean change f satisfies |f + u / 2|^2 <= (|u|^2 + D) / 4, which is the rule.
-With `network.coulomb_friction` friction keeps k S in place of k T, with S = T - |B| u / |u|: the force of sliding, to
-which the network adds T. In k, |S| and S replace |T| and T.
 With `moving` v is the velocity relative to the surfaces, v - V of hgn.network.moving. It adds no columns.
 Shape legend: N particles, C coarsest cells, S scenes, P parameters (in names of tensors only), K columns.
 """
@@ -58,7 +56,6 @@ class SurfaceFriction:
     wall_C6: torch.Tensor  # sum of w_pC mu min(1, 2 nearness) for each wall: lower x, y, z, then upper
     velocity_C3: torch.Tensor  # mean of v - V + g in units of s_a
     variance_C: torch.Tensor  # mean square of the differences of v - V from its mean, in these units
-    coulomb: bool = False  # network.coulomb_friction
 
 
 def physics_widths(config: NetworkConfig) -> tuple[int, int, int]:
@@ -169,27 +166,18 @@ def surface_friction(
     return SurfaceFriction(torch.cat(columns, -1), obstacle_C33, wall_C6, mean_C4[:, :3], variance_C)
 
 
-def coulomb_limit(friction: SurfaceFriction, push_C3: torch.Tensor) -> torch.Tensor:
-    """Returns |B| [C] for y, in the module's symbols."""
-    lower_C3, upper_C3 = friction.wall_C6[:, :3], friction.wall_C6[:, 3:]
-    bound_C3 = lower_C3 * push_C3.clamp(min=0) + upper_C3 * push_C3.clamp(max=0)
-    return _length(bound_C3 + (friction.obstacle_C33 @ push_C3[..., None]).squeeze(-1))
-
-
-def sliding_force(limit_C: torch.Tensor, free_C3: torch.Tensor) -> torch.Tensor:
-    """Returns -|B| u / |u| [C, 3] for |B| and u."""
-    return -(limit_C / _length(free_C3).clamp(min=TINY))[:, None] * free_C3
-
-
 def friction_fraction(
     friction: SurfaceFriction,
     force_C3: torch.Tensor,
-    limit_C: torch.Tensor,
+    push_C3: torch.Tensor,
     free_C3: torch.Tensor,
     slip_C33: torch.Tensor,
 ) -> torch.Tensor:
-    """Returns k [C], the fraction of a force that friction leaves. Arguments: c T or c S, c |B|, u and Q."""
-    length_C = _length(force_C3)
+    """Returns k [C], the fraction of T that friction leaves. Arguments, in the module's symbols: c T, c y, u and Q."""
+    lower_C3, upper_C3 = friction.wall_C6[:, :3], friction.wall_C6[:, 3:]
+    bound_C3 = lower_C3 * push_C3.clamp(min=0) + upper_C3 * push_C3.clamp(max=0)
+    bound_C3 = bound_C3 + (friction.obstacle_C33 @ push_C3[..., None]).squeeze(-1)
+    limit_C, length_C = _length(bound_C3), _length(force_C3)
     cone_C = limit_C / torch.maximum(limit_C, length_C).clamp(min=TINY)
     # b solves square b^2 + slope b = variance / 4; the two forms of the solution avoid cancellation
     force_C3, free_C3 = ((slip_C33 @ vector_C3[..., None]).squeeze(-1) for vector_C3 in (force_C3, free_C3))

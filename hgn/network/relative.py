@@ -26,7 +26,7 @@ them. These properties hold for any parameters:
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -35,15 +35,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.moving import surface_velocity
 from hgn.network.obstacles import ObstacleCells, first_surface
-from hgn.network.own_physics import (
-    SurfaceFriction,
-    coulomb_limit,
-    friction_fraction,
-    has_friction,
-    sliding_force,
-    surface_friction,
-    wall_contact,
-)
+from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction, wall_contact
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall within which the network sees it, in finest cells
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
@@ -104,7 +96,6 @@ def relative_features(
     friction = None
     if has_friction(state) and "friction" in config.own_physics:
         friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale, local=local)
-        friction = replace(friction, coulomb=config.coulomb_friction)
     contacts = Contacts(disturbed_C, touched_C, normal_C33, friction)
     gate_N = (grid.weight_N8 * touched_C[grid.coarsest_cells]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
@@ -303,13 +294,10 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     if contacts.friction is not None:
         pushed_C3 = torch.zeros_like(along_C3).index_add(0, receiver_E, share_E[:, None] * push_E3)
         free_C3 = (slip_C33 @ (contacts.friction.velocity_C3 + disturbed_C[:, None] * pushed_C3)[..., None]).squeeze(-1)
-        limit_C = coulomb_limit(contacts.friction, along_C3 / (FEW + RARE * trace(contacts.normal_C33))[:, None])
-        sum_C3, felt_C = along_C3, disturbed_C * touched_C
-        if contacts.friction.coulomb:
-            sum_C3 = along_C3 + sliding_force(limit_C, free_C3)
-        force_C3 = felt_C[:, None] * sum_C3
-        part_C = friction_fraction(contacts.friction, force_C3, felt_C * limit_C, free_C3, slip_C33)
-        along_C3 = along_C3 - part_C[:, None] * sum_C3
+        force_C3 = (disturbed_C * touched_C)[:, None] * along_C3
+        push_C3 = force_C3 / (FEW + RARE * trace(contacts.normal_C33))[:, None]
+        part_C = friction_fraction(contacts.friction, force_C3, push_C3, free_C3, slip_C33)
+        along_C3 = along_C3 - part_C[:, None] * along_C3
     change_C3 = change_C3 - touched_C[:, None] * along_C3
     change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
     felt_E = 0.5 * disturbed_C[sender_E]

@@ -179,7 +179,7 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 
 
 # settings in which a network of relative inputs may differ from training.init_weights
-FREE = ("network.inputs", "network.obstacle_distance", "network.coulomb_friction")
+FREE = ("network.inputs", "network.obstacle_distance")
 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:

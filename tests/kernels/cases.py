@@ -154,7 +154,6 @@ RELATIVE = {"inputs": "relative"}
 OWN = {"inputs": "local", "own_physics": ("friction", "parameters")}
 ELASTIC = {"own_physics": ("friction", "parameters", "elastic"), "materials": MATERIALS}
 MOVING = OWN | {"own_physics": ("friction", "parameters", "moving")}
-COULOMB = {"coulomb_friction": True}
 NEAR = {"obstacle_distance": True}
 SHUFFLED = ("water", "snow", "sand")
 # Relative inputs: in the weights of normals the rounding of distances counts tenfold (FEW).
@@ -181,9 +180,6 @@ CASES = {
     "friction that stops": Case(
         lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 2e-4, OWN
     ),  # PyTorch in float32: 1.7e-4
-    "Coulomb's law": Case(lambda: rough_state(CROWD), 2e-4, OWN | COULOMB),
-    "Coulomb's law that stops": Case(lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 2e-4, OWN | COULOMB),
-    "Coulomb's law of moving obstacles": Case(lambda: swept_state(CROWD, distance=True), 2e-4, MOVING | NEAR | COULOMB),
     "parameters": Case(lambda: rough_state(SEVERAL), 4e-5, RELATIVE | {"own_physics": ("parameters",)}),
     "moving obstacles": Case(lambda: swept_state(CROWD), 1e-4, MOVING),
     "moving obstacles alone": Case(

@@ -56,7 +56,7 @@ settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="local", width=16, levels=3, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
 constrained = StepConfig(0.3, (0.02, 0.04), 1e-3)
-near = replace(relative, obstacle_distance=True, own_physics=("friction", "moving"), coulomb_friction=True)
+near = replace(relative, obstacle_distance=True, own_physics=("friction", "moving"))
 for seeing, step in ((relative, StepConfig()), (relative, constrained.in_training), (near, constrained)):
     of_relative |= frame_of(seeing, step, "fp16", (9000, 3000, 900), scenes=2, particles=9000)[0]
 of_relative |= launches_of(PrecompileJob(near, settings, "fp16", False, False, 9000, (9000, 3000, 900), 90))

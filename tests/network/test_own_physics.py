@@ -244,22 +244,3 @@ def test_gradients_of_a_rollout_by_physics():
         assert float((ends[0] - ends[1]).detach()) / 2e-5 == pytest.approx(float(gradient.sum()), rel=1e-4)
     with pytest.raises(ConfigError, match=r"physics must be of the network's inputs \(none\), got 'wall_friction'"):
         Simulator(network_of(inputs="relative"), 60.0, "torch").differentiable(scene, 2, wall_friction=walls_3)
-
-
-@pytest.mark.parametrize("speed", [0.4e-3, 5e-3, 0.1])
-def test_a_silent_network_slides_by_coulombs_law(speed):
-    """With coulomb_friction a block that slides on a floor, and whose output only holds it up, is slowed down by mu g
-    at any speed (domain units per frame), but not beyond rest; without, nothing brakes it."""
-    state = on_floor(0.3, velocity=(0.6 * speed, 0.0, -0.8 * speed), count=200)
-    pushes = []
-    for coulomb in (True, False):
-        network = network_of(inputs="relative", own_physics=OWN, coulomb_friction=coulomb)
-        grid, scale = network.grid(state), network.normaliser.acceleration_std[0]
-        _, contacts = network.relative_features(state, grid)
-        output_N9 = torch.cat([-state.gravity_S3[0] / scale, torch.zeros(6)]).double().expand(200, 9)
-        pushes.append((balanced(output_N9, contacts, grid) * scale).detach().mean(0).numpy())
-    slowed = min(0.3 * 2.7e-3, speed)
-    np.testing.assert_allclose(pushes[0][[0, 2]], (-0.6 * slowed, 0.8 * slowed), rtol=0.012)
-    assert np.abs(pushes[1][[0, 2]]).max() < 1e-12
-    with pytest.raises(ConfigError, match="coulomb_friction must be false without friction in own_physics"):
-        NetworkConfig(inputs="relative", coulomb_friction=True)

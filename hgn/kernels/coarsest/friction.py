@@ -38,7 +38,7 @@ def dot(a, b):
 
 @triton.jit
 def _rough(friction, cell, there, ratio, force, OUT: tl.constexpr):
-    """Returns B of a force T, and the matrix of its derivatives by T: xx, yy, zz, yz, xz, xy."""
+    """Returns B, and the matrix of its derivatives by the force c T: xx, yy, zz, yz, xz, xy."""
     xx, yy, zz = three_columns(friction, cell, 0, there, ratio, OUT)
     yz, xz, xy = three_columns(friction, cell, 3, there, ratio, OUT)
     lower = three_columns(friction, cell, 6, there, ratio, OUT)
@@ -60,38 +60,22 @@ def _product(matrix, vector):
 
 @triton.jit
 def removed_along(
-    friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse,
-    COULOMB: tl.constexpr, OUT: tl.constexpr,
-):  # fmt: skip
-    """Returns the part of T = Q R that surfaces remove, T - k T, or T - k S with COULOMB. `along` is T, and `impulse` A
-    without the factor d.
+    friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT: tl.constexpr
+):
+    """Returns the part of T = Q R that surfaces remove, (1 - k) T. `along` is T, and `impulse` A without the factor d.
 
-    Writes to `fraction` [C, OUT] for the backward pass: T or S; k; and the derivatives of k by R and A, both times c.
-    With COULOMB also: c k times the derivative of |B| by R; and u times the root of c k |B| / |u|^3.
+    Writes to `fraction` [C, OUT] for the backward pass: T, k, and the derivatives of k by R and by A, both times c.
     """
     c = disturbed * touched
+    force = c * along[0], c * along[1], c * along[2]
     x, y, z = three_columns(friction, cell, 12, there, inverse, OUT)
     variance = tl.load(friction + cell * OUT + 15, mask=there, other=0.0) * inverse - (x * x + y * y + z * z)
     variance = tl.maximum(variance, 0.0)
     free = x + disturbed * impulse[0], y + disturbed * impulse[1], z + disturbed * impulse[2]
-    slip = along_surfaces(matrix, free)  # u
-    bound, slopes = _rough(friction, cell, there, ratio, along, OUT)
-    limit = tl.sqrt(dot(bound, bound))
-    kept = along
-    if COULOMB:
-        speed = tl.maximum(tl.sqrt(dot(slip, slip)), TINY)
-        slowing = limit / speed
-        kept = along[0] - slowing * slip[0], along[1] - slowing * slip[1], along[2] - slowing * slip[2]
-    force = c * kept[0], c * kept[1], c * kept[2]
-    free = along_surfaces(matrix, slip)  # Q u
-    slipping = along_surfaces(matrix, force)
-    by_limit = _product(slopes, bound)
-    by_limit = (
-        by_limit[0] / tl.maximum(limit, TINY),
-        by_limit[1] / tl.maximum(limit, TINY),
-        by_limit[2] / tl.maximum(limit, TINY),
-    )
-    limit, length = c * limit, tl.sqrt(dot(force, force))
+    free = along_surfaces(matrix, along_surfaces(matrix, free))  # Q u
+    slipping = along_surfaces(matrix, force)  # Q c T
+    bound, slopes = _rough(friction, cell, there, ratio, force, OUT)
+    limit, length = tl.sqrt(dot(bound, bound)), tl.sqrt(dot(force, force))
     cone = limit / tl.maximum(tl.maximum(limit, length), TINY)
     # b solves square b^2 + slope b = variance / 4; the two forms of the solution avoid cancellation
     square, slope = dot(slipping, slipping), dot(slipping, free)
@@ -102,64 +86,36 @@ def removed_along(
     part = tl.minimum(cone, slowest)
     # Derivatives of b by Q c T and by Q u are those of the equation that b solves.
     ratio_of = tl.where(cone <= slowest, 0.0, part / root)
+    by_limit = _product(slopes, bound)
     by_cone = (cone <= slowest) & (limit < length)
-    inverse_length = tl.where(by_cone, 1 / tl.maximum(length, TINY), 0.0)
+    inverse_limit = tl.where(by_cone, 1 / tl.maximum(limit * length, TINY), 0.0)
     inverse_square = tl.where(by_cone, cone / tl.maximum(length * length, TINY), 0.0)
     by_force, by_free = (), ()
     for i in tl.static_range(3):
         by_force = by_force + (-ratio_of * (2 * part * slipping[i] + free[i]),)  # noqa: RUF005
         by_free = by_free + (-ratio_of * slipping[i],)  # noqa: RUF005
-    by_force, by_free = along_surfaces(matrix, by_force), along_surfaces(matrix, by_free)
-    by_force = (
-        by_force[0] - force[0] * inverse_square,
-        by_force[1] - force[1] * inverse_square,
-        by_force[2] - force[2] * inverse_square,
-    )
-    by_bound = inverse_length
-    if COULOMB:  # S depends on R and A also by |B| and u
-        against = dot(by_force, slip) / speed
-        by_bound -= against
-        turning = c * slowing
-        by_free = (
-            by_free[0] - turning * (by_force[0] - against * slip[0] / speed),
-            by_free[1] - turning * (by_force[1] - against * slip[1] / speed),
-            by_free[2] - turning * (by_force[2] - against * slip[2] / speed),
-        )
+    by_force = along_surfaces(matrix, by_force)
     by_mean = ()
     for i in tl.static_range(3):
-        by_mean = by_mean + (c * c * (by_force[i] + by_limit[i] * by_bound),)  # noqa: RUF005
+        total = by_force[i] + by_limit[i] * inverse_limit - force[i] * inverse_square
+        by_mean = by_mean + (c * c * total,)  # noqa: RUF005
     by_mean = along_surfaces(matrix, by_mean)
-    by_impulse = along_surfaces(matrix, by_free)
+    by_impulse = along_surfaces(matrix, along_surfaces(matrix, by_free))
     line = fraction + cell * OUT
     tl.store(line + 3, part, mask=there)
-    if COULOMB:
-        by_limit = along_surfaces(matrix, by_limit)
-        unit = tl.sqrt(c * part * slowing) / speed
     for i in tl.static_range(3):
-        tl.store(line + i, kept[i], mask=there)
+        tl.store(line + i, along[i], mask=there)
         tl.store(line + 4 + i, by_mean[i], mask=there)
         tl.store(line + 7 + i, c * by_impulse[i], mask=there)
-        if COULOMB:
-            tl.store(line + 10 + i, c * part * by_limit[i], mask=there)
-            tl.store(line + 13 + i, unit * slip[i], mask=there)
-    return along[0] - part * kept[0], along[1] - part * kept[1], along[2] - part * kept[2]
+    return along[0] - part * along[0], along[1] - part * along[1], along[2] - part * along[2]
 
 
 @triton.jit
-def with_friction(fraction, cell, there, mean, matrix, COULOMB: tl.constexpr, OUT: tl.constexpr):
+def with_friction(fraction, cell, there, mean, OUT: tl.constexpr):
     """Returns the gradient by A of cells, [C] or across faces [C, 8], from the gradient of their accelerations.
     Both are without the factor d."""
     slope = dot(mean, three_columns(fraction, cell, 0, there, 1.0, OUT))
     x, y, z = three_columns(fraction, cell, 7, there, slope, OUT)
-    if COULOMB:
-        unit = three_columns(fraction, cell, 13, there, 1.0, OUT)
-        size = dot(unit, unit)
-        along = dot(mean, unit)
-        turned = along_surfaces(
-            matrix,
-            (size * mean[0] - along * unit[0], size * mean[1] - along * unit[1], size * mean[2] - along * unit[2]),
-        )
-        x, y, z = x - turned[0], y - turned[1], z - turned[2]
     return mean[0] + x, mean[1] + y, mean[2] + z
 
 

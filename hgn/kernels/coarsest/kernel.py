@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.bodies import body_of, coarsest_cells, cross, inertia_of, one_over, rotation, three_columns
-from hgn.kernels.coarsest.friction import TINY, along_surfaces, dot, removed_along, slip_of, with_friction
+from hgn.kernels.coarsest.friction import along_surfaces, dot, removed_along, slip_of, with_friction
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import OUTPUTS
@@ -93,14 +93,12 @@ def _pairs(
 @triton.jit
 def balance(
     sums, moments, felt, motion, neighbour, geometry, counts, table, friction, fraction, capacity, few, rare,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, COULOMB: tl.constexpr, OVERLAP: tl.constexpr,
-    BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the table [C, OUT] of the coarsest cells from sums of particles' outputs.
 
     Columns 0 to 2 are the acceleration that a cell adds to its particles at its middle. Column 3 is the factor of the
-    particles' own output. Columns 4 to 6 are the rate of rotation that the cell adds. For FRICTION and COULOMB see
-    removed_along.
+    particles' own output. Columns 4 to 6 are the rate of rotation that the cell adds. FRICTION: see removed_along.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -148,7 +146,7 @@ def balance(
         for i in tl.static_range(3):
             impulse = impulse + (tl.sum(share * (felt_by * traction[i] + swing[i]), 1),)  # noqa: RUF005
         along = removed_along(
-            friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, COULOMB, OUT
+            friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT
         )  # fmt: skip
     for i in tl.static_range(3):
         pushed = tl.sum(share * (felt_by * traction[i] + swing[i]), 1) - free * known * mean[i]
@@ -161,8 +159,7 @@ def balance(
 @triton.jit
 def balance_backward(
     sums, moments, felt, motion, neighbour, geometry, counts, table, friction, fraction, capacity, few, rare,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, COULOMB: tl.constexpr, OVERLAP: tl.constexpr,
-    BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the table [C, OUT] from sums of gradients of the result of `balance` and of their moments.
 
@@ -202,17 +199,11 @@ def balance_backward(
         slope = dot(mean, three_columns(fraction, cell, 0, there, 1.0, OUT))
         k = tl.load(fraction + cell * OUT + 3, mask=there, other=0.0)
         by_mean = three_columns(fraction, cell, 4, there, 1.0, OUT)
-        if COULOMB:
-            unit = three_columns(fraction, cell, 13, there, 1.0, OUT)
-            against = dot(mean, unit) / tl.maximum(tl.sqrt(dot(unit, unit)), TINY)
-            by_limit = three_columns(fraction, cell, 10, there, 1.0, OUT)
     for i in tl.static_range(3):
         own = factor * known * mean[i] - lever[i]
         own -= disturbed * touched * along[i]
         if FRICTION:
             own += k * disturbed * touched * along[i] + slope * by_mean[i]
-            if COULOMB:
-                own -= against * by_limit[i]
         tl.store(line + i, own, mask=there)
         tl.store(line + 10 + i, turn[i], mask=there)
     tl.store(line + 9, disturbed * (touched + free * known), mask=there)
@@ -220,9 +211,8 @@ def balance_backward(
     their_moment = three_columns(sums, other, 3, other >= 0, beside, OUT)
     lever = cross(middle, their_mean)
     if FRICTION:
-        mean = with_friction(fraction, cell, there, mean, matrix, COULOMB, OUT)
-        _, theirs = slip_of(moments, other, other >= 0, few, rare, OUT)
-        their_mean = with_friction(fraction, other, other >= 0, their_mean, theirs, COULOMB, OUT)
+        mean = with_friction(fraction, cell, there, mean, OUT)
+        their_mean = with_friction(fraction, other, other >= 0, their_mean, OUT)
     gap = (mean[0][:, None] - their_mean[0], mean[1][:, None] - their_mean[1], mean[2][:, None] - their_mean[2])
     swing = cross(apart, gap)
     turned = ()

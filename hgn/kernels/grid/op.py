@@ -363,7 +363,7 @@ class DeviceGrid:
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
             sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
             table=self.table_C, friction=self.friction_C, fraction=self.friction_fraction_C, few=FEW, rare=RARE,
-            FRICTION=self.friction > 0, COULOMB=self.config.coulomb_friction, **sizes, launch_pdl=overlap,
+            FRICTION=self.friction > 0, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
