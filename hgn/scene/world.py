@@ -244,8 +244,7 @@ def _edge(new: Layout) -> None:
     plate, size = new("plate"), new("size")
     x, y, z = new.along(0, 0.5 * plate), new.low + new("height"), new.along(2, 0.5 * plate)
     new.place("square", plate, (x, y, z))
-    side = 1.0 if new.chance(0.5) else -1.0
-    edge = x + side * (0.5 * plate + new("beyond"))
+    edge = x + (1.0 if new.chance(0.5) else -1.0) * (0.5 * plate + new("beyond"))
     offset = (new.rng.random() - 0.5) * (plate - size)
     centre = (edge, y + 0.5 * size + new("drop", small=True) + ROUNDING, z + offset)
     if new.chance(0.5):
@@ -269,13 +268,13 @@ def _stack(new: Layout) -> None:
 
 
 def _apart(new: Layout) -> None:
-    """Places bodies on the floor without contact. Some slide, most slowly. In 30 %, tilted gravity moves all."""
+    """Places bodies on the floor without contact. Some slide, many slowly. In 30 %, tilted gravity moves all."""
     new.take_domain("room", "hall", "long")
     for _ in range(new.count("bodies")):
         size, velocity = new("size"), (0.0, 0.0, 0.0)
         if new.chance(0.5):
             across_x, across_z = random_direction(new.rng, 2).tolist()
-            speed = new("speed", small=True)
+            speed = new("speed", small=new.chance(0.5))
             velocity = (speed * across_x, 0.0, speed * across_z)
         centre = (new.along(0, 0.5 * size), new.low + 0.5 * size + ROUNDING, new.along(2, 0.5 * size))
         new.body(size, centre, velocity)
@@ -400,6 +399,7 @@ def _paper(new: Layout) -> SceneConfig:
     config = replace(config, group_count=groups, obstacle_count=0)
     if new.kind == "funnel":
         low, high = RANGES["funnel"]["hole"]
+        config = replace(config, materials=("sand",)) if "sand" in config.materials and new.chance(0.5) else config
         return replace(config, obstacle_count=4, funnel_scene_fraction=1.0, funnel_hole=(low, high))
     if new.kind in ("obstacles", "motion"):
         config = replace(config, obstacle_count=new.count("obstacles"))
