@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ from hgn.system.loading import loading
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
+    from hgn.data.batch import Batch
     from hgn.runtime.rollouts import RolloutResult
     from hgn.runtime.simulator import Simulator
     from hgn.runtime.torch_backend import Backend
@@ -87,24 +88,42 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
-    """Returns a row for each predictor: {"system", "one_step_mse", "by_material"}."""
-    from hgn.training.errors import baselines, frame_batches, network_predictor, one_step_errors
+    """Returns a row for each predictor: {"system", "one_step_mse", "by_material"}.
+
+    If scenes are of several kinds (`scene.kinds`), the network's row also has "by_kind": {kind: {"one_step_mse",
+    "fraction" of the whole squared error}}, the largest fraction first.
+    """
+    from hgn.training.errors import SquaredError, baselines, frame_batches, network_predictor, one_step_errors
 
     network, device = backend.network, backend.device
     predictors = {"network": network_predictor(backend)} | baselines(network)
     total = sum(-(-(len(episode.position_TN3) - 1) // config.frame_stride) for episode in episodes)
+    kinds: dict[str, list[Episode]] = {}
+    for episode in episodes:
+        kinds.setdefault(episode.specification.get("layout", ""), []).append(episode)
+    errors, by_kind = {name: SquaredError() for name in predictors}, {}
     with bar("one-step errors", total=total, unit="frame") as progress:
 
-        def counted() -> Any:
-            for batch in frame_batches(episodes, network, config.frame_stride):
+        def counted(batches: Iterable[Batch]) -> Iterator[Batch]:
+            for batch in batches:
                 yield batch
                 progress.update(len(batch.particles_S))
 
-        errors = one_step_errors(predictors, counted(), device, network.config.materials)
-    return [
+        for kind, of_kind in kinds.items():
+            batches = counted(frame_batches(of_kind, network, config.frame_stride))
+            found = one_step_errors(predictors, batches, device, network.config.materials)
+            by_kind[kind] = found["network"]
+            for name, error in found.items():
+                errors[name].include(error)
+    rows: list[dict[str, Any]] = [
         {"system": name, "one_step_mse": error.mse, "by_material": error.by_material()}
         for name, error in errors.items()
     ]
+    if len(kinds) > 1:
+        whole = sum(errors["network"].total.values()) or 1.0
+        parts = sorted(((sum(e.total.values()) / whole, kind) for kind, e in by_kind.items()), reverse=True)
+        rows[0]["by_kind"] = {k: {"one_step_mse": by_kind[k].mse, "fraction": part} for part, k in parts}
+    return rows
 
 
 def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list[RolloutResult]:
@@ -179,6 +198,10 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
         if "one_step_mse" in row:
             materials = ", ".join(f"{name} {value:.2e}" for name, value in row["by_material"].items())
             lines.append(f"{row['system']:<20} {row['one_step_mse']:>12.3e}  {materials}")
+            for kind, part in row.get("by_kind", {}).items():
+                lines.append(
+                    f"  {kind or 'no kind':<18} {part['one_step_mse']:>12.3e}  {part['fraction']:.0%} of the error"
+                )
         else:
             frames = ", ".join(f"frame {frame} {value:.2e}" for frame, value in row["position_mse"].items())
             lines.append(f"{row['system']:<20} position MSE: {frames}")

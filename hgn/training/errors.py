@@ -47,6 +47,12 @@ class SquaredError:
             self.total[name] = self.total.get(name, 0.0) + total
             self.count[name] = self.count.get(name, 0) + count
 
+    def include(self, other: "SquaredError") -> None:
+        """Adds the sums of another one."""
+        for name in other.total:
+            self.total[name] = self.total.get(name, 0.0) + other.total[name]
+            self.count[name] = self.count.get(name, 0) + other.count[name]
+
     @property
     def mse(self) -> float:
         count = sum(self.count.values())

@@ -14,6 +14,7 @@ from PIL import Image
 
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
+from hgn.evaluate import EvaluateConfig, one_step_rows, table
 from hgn.runtime.backend import build
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
@@ -58,6 +59,31 @@ def test_baseline_errors_are_those_of_training(episode):
     batches = frame_batches([episode], network, 1, 100)
     expected = one_step_errors({"fall": lambda b: 0.9 * ballistic(b)}, batches, CPU, network.config.materials)
     assert gravity.one_step(episode, 1).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
+
+
+def test_one_step_errors_by_kind_of_scene(episodes, episode, capsys):
+    """Kinds have the errors of their episodes alone, and fractions of the whole error that sum to 1; data without
+    kinds have no such figures."""
+    network = network_of(torch.float32, obstacle_features=False)
+    backend, config = build("torch", network, "fp32"), EvaluateConfig(data="data")
+    of = lambda kind, e: replace(e, specification=e.specification | {"layout": kind})  # noqa: E731
+    assert len(episodes) == 2
+    mixed = [of("pool", episodes[0]), of("jet", episode), of("pool", episodes[1])]
+    whole = {row["system"]: row for row in one_step_rows(backend, [*episodes, episode], config)}
+    rows = {row["system"]: row for row in one_step_rows(backend, mixed, config)}
+    jet, pools = (one_step_rows(backend, e, config)[0]["one_step_mse"] for e in ([episode], episodes))
+    kinds = rows["network"]["by_kind"]
+    assert kinds["jet"]["one_step_mse"] == pytest.approx(jet, rel=1e-5)
+    assert kinds["pool"]["one_step_mse"] == pytest.approx(pools, rel=1e-5)
+    assert sum(kind["fraction"] for kind in kinds.values()) == pytest.approx(1)
+    size = lambda e: e.particle_count * (len(e.position_TN3) - 1)  # noqa: E731
+    ratio = jet * size(episode) / (pools * sum(map(size, episodes)))
+    assert kinds["jet"]["fraction"] / kinds["pool"]["fraction"] == pytest.approx(ratio, rel=1e-5)
+    for name, row in rows.items():
+        assert row["one_step_mse"] == pytest.approx(whole[name]["one_step_mse"], rel=1e-5)
+        assert row["by_material"] == pytest.approx(whole[name]["by_material"], rel=1e-5)
+    assert "by_kind" not in whole["network"] and "by_kind" not in rows["ballistic motion"]
+    assert "pool" in table(list(rows.values()), config, 3) and "pool" not in table(list(whole.values()), config, 3)
 
 
 def test_one_step_errors_of_triton(episode):
