@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_991,
+    "hgn": 34_021,
     "datagen": 8_939,
     "tools": 6_354,
-    "tests": 34_701,
+    "tests": 34_742,
 }
 SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
 

@@ -1,6 +1,7 @@
 """The Lightning module: a network in training, its updates, and the content of a checkpoint."""
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from hgn.runtime.backend import build, fastest_stepped
 from hgn.runtime.torch_backend import Backend
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import AVERAGED, NETWORK, SECTION, DataInfo, Progress
+from hgn.training.pushforward import SimulationStoppedError
 from hgn.training.schedule import learning_rate
 from hgn.training.torch_updates import TorchUpdates
 from hgn.training.updates import Ranks, TrainedNetwork, Updates, build_optimizer
@@ -45,6 +47,8 @@ class TrainingModule(LightningModule):
         self.training_config, self.data, self.backend = training, data, backend
         self._precisions = precisions
         self.update = 0  # number of updates
+        # whether simulations between updates on backend torch shall end; only without other ranks, which do not know
+        self.stopped: Callable[[], bool] = lambda: False
         self.skipped = 0  # number of skipped updates at the last log line
         self.sampler_state = SamplerState()
         # see TrainedNetwork; they stay on the device, which avoids synchronisation
@@ -103,7 +107,9 @@ class TrainingModule(LightningModule):
             self.network, optimizer, self.loss_sum, counters=self.gradient_counters, averaged=self.averaged
         )
         if self.backend == "torch":
-            self.updates = TorchUpdates(trained, config, rank, self.manual_backward, precision=self._precisions[0])
+            self.updates = TorchUpdates(
+                trained, config, rank, self.manual_backward, precision=self._precisions[0], stopped=self.stopped
+            )
         else:
             # imported here, because backend torch does without Triton
             from hgn.training.triton_updates import TritonUpdates
@@ -114,7 +120,10 @@ class TrainingModule(LightningModule):
             )
 
     def training_step(self, chunk: WindowChunk | EpisodeChunk) -> None:
-        self.updates.run(chunk, self.update)
+        try:
+            self.updates.run(chunk, self.update)
+        except SimulationStoppedError:  # before the chunk's first update
+            return
         self.update += len(chunk.samples)
         self.sampler_state = chunk.sampler_state
 

@@ -55,6 +55,10 @@ DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # targets clamp the position error to this on each axis, in finest cells
 
 
+class SimulationStoppedError(Exception):
+    """A stop request ended the simulations before an update. The same simulations are made when the run resumes."""
+
+
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
     """Returns the number of frames to simulate in an episode of `frame_count` frames. The episode may end earlier."""
     return max(training.pushforward_frames, int(training.pushforward_episode_fraction * frame_count))

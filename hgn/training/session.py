@@ -82,6 +82,8 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     set_matmul_precision(precisions[0])
     lightning_compat.seed_everything(training.seed, verbose=False)
     module = _module(config, start, backend, precisions)
+    if devices * nodes == 1:
+        module.stopped = lambda: stop.requested
     if backend == "triton":
         reader: ChunkReader = EpisodeReader(store, config.network, training, config.step)
     else:

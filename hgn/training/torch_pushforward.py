@@ -3,7 +3,7 @@
 Shape legend: as in hgn.training.pushforward.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -16,15 +16,15 @@ from hgn.runtime.simulation import Simulation
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.training.errors import groups_of_frames
-from hgn.training.pushforward import simulated_barrier
+from hgn.training.pushforward import SimulationStoppedError, simulated_barrier
 
 
 class TorchScenes:
     """Implements hgn.training.pushforward.SimulatedScenes."""
 
-    def __init__(self, network: ParticleNetwork) -> None:
-        """`network` computes the simulations."""
-        self._network, self._backend = network, fastest_stepped(network)
+    def __init__(self, network: ParticleNetwork, stopped: Callable[[], bool] = lambda: False) -> None:
+        """`network` computes the simulations. `stopped` is asked after each frame."""
+        self._network, self._backend, self._stopped = network, fastest_stepped(network), stopped
         self._backend.step = network.step.in_training
 
     @property
@@ -41,13 +41,19 @@ class TorchScenes:
         return list(groups_of_frames(starts))
 
     def simulate(self, starts: Sequence[tuple[Episode, int]], frames: int) -> list[torch.Tensor]:
+        """As SimulatedScenes.simulate. Raises: SimulationStoppedError after a stop request."""
+
+        def on_frame(_: int) -> None:
+            if self._stopped():
+                raise SimulationStoppedError
+
         batch = make_batch(starts, self._network.config).to(self._backend.device)
         begin = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
         clearance = self._backend.step.obstacle_clearance
         if begin.moving is not None and clearance is not None:
             begin = replace(begin, moving=begin.moving.with_barriers(clearance))
         with Simulation(self._backend.stepper, begin, isolate=True) as simulation:
-            path_FN3 = torch.from_numpy(simulation.run(frames))
+            path_FN3 = torch.from_numpy(simulation.run(frames, on_frame))
         return list(path_FN3.split(list(batch.particles_S), dim=1))
 
     def true_frames(self, episode: Episode, frame: int, simulated: int) -> torch.Tensor:

@@ -1,5 +1,6 @@
 """Training updates in PyTorch, the reference: one batch, its loss, one step of the optimiser."""
 
+import sys
 from collections.abc import Callable
 
 import torch
@@ -27,21 +28,29 @@ class TorchUpdates:
         training: TrainingConfig,
         rank: int = 0,
         backward: Callable[[torch.Tensor], None] = torch.Tensor.backward,
+        *,
         precision: str = "fp32",
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Takes PyTorch's `precision`, and `backward`, which computes a loss's gradients averaged over the ranks."""
+        """Takes PyTorch's `precision`, and `backward`, which computes a loss's gradients averaged over the ranks.
+
+        Simulations for pushforward end with SimulationStoppedError if `stopped` returns True.
+        """
         self.trained, self.training, self._backward = trained, training, backward
-        self.precision = precision
+        self.precision, self._rank = precision, rank
         self._device = next(trained.network.parameters()).device
         if self._device.type == "cpu":
             keep_freed_memory()
         self._guard = GradientGuard(trained.counters)
         self.pool: PushforwardPool[Episode, BatchSample] | None = None
         if training.pushforward_fraction > 0:
-            self.pool = PushforwardPool(TorchScenes(trained.result), training, rank)
+            self.pool = PushforwardPool(TorchScenes(trained.result, stopped), training, rank)
 
     def run(self, chunk: WindowChunk, first_update: int) -> None:
         if self.pool is not None and chunk.starts:
+            if self._device.type == "cpu" and self._rank == 0:
+                text = f"simulating {len(chunk.starts)} scenes before update {first_update + 1}"
+                print(f"{text} (training.pushforward_scenes)", file=sys.stderr, flush=True)
             self.pool.refresh(chunk.starts)
         for update, samples in enumerate(chunk.samples, first_update):
             batch = chunk.batch

@@ -18,6 +18,7 @@ from hgn import train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
+from hgn.runtime.simulation import Simulation
 from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.training import monitor
@@ -27,6 +28,7 @@ from hgn.training.data_module import EpisodeDataModule
 from hgn.training.module import TrainingModule
 from hgn.training.readers import WindowReader
 from hgn.training.stop import StopRequest
+from hgn.training.torch_pushforward import TorchScenes
 
 UPDATES = 16  # of 2 samples, where an epoch has 25
 MORE = {"optimizer": "muon", "symmetry": "gravity", "warmup_updates": 6, "ema_decay": 0.8}
@@ -213,6 +215,45 @@ def test_a_stopped_measurement_is_made_on_resume(data, tmp_path, monkeypatch, ca
         whole, cut = (read_checkpoint(tmp_path / run / "checkpoints" / name) for run in ("whole", "cut"))
         for part in ("state_dict", "optimizer_states", "hgn"):
             assert_same(cut[part], whole[part], part)
+
+
+@pytest.mark.parametrize("update", [0, 4])
+def test_a_signal_ends_simulations_before_an_update(data, tmp_path, monkeypatch, update):
+    """The run ends within a frame, with the state before the update, and then ends where an uninterrupted one does."""
+    frames, real = [], TorchScenes.simulate
+    settings = {"maximum_updates": 8, "monitor_every": 1000, **MORE, "pushforward_frames": 4}
+
+    def trained(name):
+        return train.main(train_mapping(data, tmp_path / name, **settings))
+
+    def signalled(self, starts, count):
+        run = Simulation.run
+
+        def first_frame(simulation, number, on_frame):
+            def after(frame):
+                frames.append(frame)
+                signal.raise_signal(signal.SIGTERM)
+                on_frame(frame)
+
+            return run(simulation, number, after)
+
+        simulated.append(update)
+        if len(simulated) == 1 + update // 4 and not frames:
+            with monkeypatch.context() as patch:
+                patch.setattr(Simulation, "run", first_frame)
+                return real(self, starts, count)
+        return real(self, starts, count)
+
+    simulated: list[int] = []
+    assert trained("whole") == 0
+    monkeypatch.setattr(TorchScenes, "simulate", signalled)
+    assert trained("cut") == 128 + signal.SIGTERM
+    assert len(frames) == 1
+    assert read_checkpoint(tmp_path / "cut" / "checkpoints" / "last.ckpt")["hgn"]["updates"] == update
+    assert trained("cut") == 0
+    whole, cut = (read_checkpoint(tmp_path / run / "checkpoints" / "last.ckpt") for run in ("whole", "cut"))
+    for part in ("state_dict", "optimizer_states", "hgn"):
+        assert_same(cut[part], whole[part], part)
 
 
 def test_ranks_stop_before_the_next_update_after_a_stopped_measurement():
