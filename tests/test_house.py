@@ -21,7 +21,7 @@ LINES = {  # of Python, in tracked files
     "tools": 6_354,
     "tests": 34_742,
 }
-SETTINGS = 237  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES: dict[str, int] = {}
