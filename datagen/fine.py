@@ -15,8 +15,8 @@ import numpy as np
 from hgn.config import DatagenConfig, MpmConfig
 from hgn.scene.distance import closest_points
 from hgn.scene.scene import Scene
+from hgn.scene.streams import Stream, stream
 
-STREAM = 4  # number of the random stream; hgn.scene.random_scene uses 1 to 3, hgn.scene.world 5
 SURFACE_FRACTION = 0.9  # fraction of the distance to an obstacle's surface within which children may start
 
 
@@ -68,7 +68,7 @@ def scene_to_simulate(scene: Scene, config: DatagenConfig) -> Scene:
 
 def _offsets(scene: Scene, children: int, wall: float) -> np.ndarray:
     """Returns the children's offsets, float64 [N, C, 3]. The first offset and their mean are zero."""
-    generator = np.random.Generator(np.random.PCG64([scene.seed, STREAM]))
+    generator = stream(scene.seed, Stream.FINER_PARTICLES)
     # edge of the cube that a particle fills; in single precision, because cubic roots differ between machines
     edge = scene.cell_size / float(np.float32((scene.particles_per_cell or 8.0) ** (1 / 3)))
     offset_NC3 = np.zeros((scene.particle_count, children, 3))

@@ -16,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_021,
+    "hgn": 34_047,
     "datagen": 8_939,
-    "tools": 6_354,
+    "tools": 6_352,
     "tests": 34_742,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config

@@ -34,7 +34,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.emission import at_entry, at_start, entry_frames, require_free_entries
 from hgn.scene.episode import Episode
-from hgn.scene.episode_obstacles import field_around, known_obstacles
+from hgn.scene.episode_obstacles import corners_at_rest, field_around
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS, elastic_particles
 from hgn.scene.moving import MovingObstacle, at_rest, moving_obstacles, moving_of_episode
@@ -88,7 +88,7 @@ class InitialState:
             obstacle_grid=episode.obstacle_grid,
             domain_size=episode.domain_size,
             gravity=episode.gravity,
-            corners=lambda: all_corners(at_rest(known_obstacles(episode.specification) or ())),
+            corners=lambda: corners_at_rest(episode.specification),
             materials=episode.materials,
             past_HN3=episode.past_HN3,
             dimensions=episode.dimensions,

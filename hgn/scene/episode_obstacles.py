@@ -45,6 +45,11 @@ def known_obstacles(specification: Mapping[str, Any]) -> tuple[Obstacle, ...] | 
     )
 
 
+def corners_at_rest(specification: Mapping[str, Any]) -> np.ndarray:
+    """Returns the triangle corners of the known obstacles that do not move, float64 [F, 3, 3]."""
+    return all_corners([obstacle for obstacle in known_obstacles(specification) or () if obstacle.motion is None])
+
+
 def obstacle_of_record(record: Mapping[str, Any], name: str) -> Obstacle:
     """Returns the obstacle that a random scene's specification describes."""
     position, rotation_33 = tuple(record["position"]), quaternion_rotation(tuple(record["quaternion"]))
@@ -68,8 +73,7 @@ def field_of_episode(episode: Episode) -> ObstacleGrid:
 @lru_cache(maxsize=256)
 def _field(grid: ObstacleGrid, specification: str, domain_size: Vector) -> ObstacleGrid:
     """Does not take the episode, because the cache would keep its positions in memory."""
-    still = [obstacle for obstacle in known_obstacles(json.loads(specification)) or () if obstacle.motion is None]
-    return field_around(grid, all_corners(still), domain_size)
+    return field_around(grid, corners_at_rest(json.loads(specification)), domain_size)
 
 
 def field_around(grid: ObstacleGrid, corner_F33: np.ndarray, domain_size: Vector) -> ObstacleGrid:

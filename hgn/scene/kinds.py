@@ -43,7 +43,7 @@ MOVING_RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "conveyor": {"size": (0.06, 0.12), "plate": (0.35, 0.6), "height": (0.06, 0.2), "speed": (0.1, FASTEST)},
     "falling": {"size": (0.08, 0.2), "height": (0.1, 0.4), "speed": (0.3, FASTEST)},
 }
-# Kinds of scenes with elastic bodies. The others fill a part of the domain from wall to wall.
+# Kinds of scenes with elastic bodies. The others are for material that flows: pools, columns, funnels and paddles.
 ELASTIC_KINDS = (
     "obstacles", "motion", "collision", "drop", "slope", "edge", "stack", "apart", "bowl", "stairs", "jet",
     "piston", "conveyor", "falling",

@@ -14,11 +14,11 @@ from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.kinds import ELASTIC_KINDS, FASTEST
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.scene import Scene
+from hgn.scene.streams import Stream, stream
 
 ORDINARY = 1 / 2  # fraction of scenes without friction and with the defaults of all parameters
 ALONE = 1 / 3  # of the others: fraction with friction only, and with parameters only
 ELASTIC = 1 / 6  # fraction of scenes with elastic bodies, half of them without other materials
-_STREAM, _ELASTIC_STREAM = 6, 7  # keys of random streams; the scene's other numbers do not depend on them
 NOMINAL_P = tuple(float(getattr(MpmConfig(), name)) for name in INPUT_PARAMETERS)
 
 
@@ -45,7 +45,7 @@ def own_ranges(drawn: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 def with_elastic_bodies(config: SceneConfig, seed: int) -> SceneConfig:
     """Returns the settings of a random scene. A fraction ELASTIC of the scenes draws from elastic bodies too."""
-    drawn, alone = np.random.Generator(np.random.PCG64([seed, _ELASTIC_STREAM])).random(2).tolist()
+    drawn, alone = stream(seed, Stream.ELASTIC).random(2).tolist()
     if "elastic" not in config.own_physics or drawn >= ELASTIC:
         return config
     materials = ("elastic",) if alone < 0.5 else (*dict.fromkeys(("elastic", *config.materials)),)
@@ -58,7 +58,7 @@ def with_drawn_physics(scene: Scene, drawn: Sequence[str], seed: int) -> Scene:
 
     A fraction ORDINARY of the scenes has neither. With less, networks forget scenes without friction.
     """
-    rng = np.random.Generator(np.random.PCG64([seed, _STREAM]))
+    rng = stream(seed, Stream.PHYSICS)
     ordinary, which = rng.random(2).tolist()
     if ordinary < ORDINARY:
         return scene

@@ -30,6 +30,7 @@ from hgn.scene.placement import (
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
+from hgn.scene.streams import Stream, stream
 from hgn.scene.world import Layout, draw_layout
 from hgn.schema import ConfigError, Vector, require, triple
 
@@ -65,8 +66,8 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
             return assemble(drawn.config, seed, drawn.gravity, drawn.obstacles, drawn.bodies, kind)
         config = drawn
     rng = np.random.Generator(np.random.PCG64(seed))
-    # separate streams: these draws do not change the scene's other numbers
-    lone_rng, motion_rng, funnel_rng = (np.random.Generator(np.random.PCG64([seed, stream])) for stream in (1, 2, 3))
+    separate = (Stream.LONE_PARTICLES, Stream.MOTION, Stream.FUNNEL)
+    lone_rng, motion_rng, funnel_rng = (stream(seed, key) for key in separate)
     gravity = _draw_gravity(config, motion_rng)
     colliding = motion_rng.random() < config.colliding_scene_fraction
     if colliding:

@@ -17,6 +17,7 @@ from hgn.scene.group import WALL_CELLS, Region, particle_count, points_in_ball, 
 from hgn.scene.kinds import ELASTIC_KINDS, MAXIMUM_PARTICLES, MOVING_FRACTION, MOVING_RANGES, RANGES
 from hgn.scene.motion import Keyframes, Motion
 from hgn.scene.placement import ROUNDING, Body, Placed, blocked, choice, filled, place_shape
+from hgn.scene.streams import Stream, stream
 from hgn.schema import ConfigError, Vector, triple
 
 DRAWS = 500  # attempts to place one scene
@@ -24,7 +25,6 @@ NEAREST_CELLS = 1.0  # smallest distance between obstacles and bodies, in solver
 NEAR_WALL = 0.08  # largest gap between a wall and a body that is placed next to it
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
-_MOVING_STREAM = 8  # key of a random stream. With 7, that of elastic bodies, all moving scenes would be elastic.
 
 # Edge lengths in cells of 1/64.
 DOMAINS: dict[str, tuple[int, int, int]] = {
@@ -428,10 +428,10 @@ def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConf
     Returns the kind and a Layout. For the kinds of `_paper` it returns settings for `hgn.scene.random_scene` instead.
     Raises: ConfigError if a kind does not fit into `config.domain_size`. Kinds of the shipped experiments fit.
     """
-    rng = np.random.Generator(np.random.PCG64([seed, 5]))
+    rng = stream(seed, Stream.KIND)
     kind = draw_kind(config.kinds, rng)
     if "moving" in config.own_physics:
-        own = np.random.Generator(np.random.PCG64([seed, _MOVING_STREAM]))
+        own = stream(seed, Stream.MOVING)
         possible = tuple(k for k in MOVING_RANGES if k in ELASTIC_KINDS or "elastic" not in config.materials)
         kind, rng = (choice(possible, own), own) if own.random() < MOVING_FRACTION else (kind, rng)
     for _ in range(DRAWS):

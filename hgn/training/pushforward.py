@@ -30,9 +30,7 @@ from hgn.data.importance import DrawnBySize
 from hgn.runtime.divergence import diverged
 from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
-from hgn.scene.episode_obstacles import known_obstacles
-from hgn.scene.moving import at_rest
-from hgn.scene.scene import all_corners
+from hgn.scene.episode_obstacles import corners_at_rest
 from hgn.schema import ConfigError, Vector
 from hgn.training.noise import noise_scale, target_acceleration
 
@@ -155,8 +153,7 @@ def simulated_barrier(episode: Episode, clearance: float) -> Barrier:
 @functools.lru_cache(maxsize=256)
 def _barrier(specification: str, cell_size: float, clearance: float, domain_size: Vector) -> Barrier:
     """Does not take the episode, because the cache would keep its positions in memory."""
-    corner_F33 = all_corners(at_rest(known_obstacles(json.loads(specification)) or ()))
-    return build_barrier(corner_F33, cell_size, clearance, domain_size)
+    return build_barrier(corners_at_rest(json.loads(specification)), cell_size, clearance, domain_size)
 
 
 class SimulatedScenes(Protocol[E, T]):

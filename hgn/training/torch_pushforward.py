@@ -23,7 +23,7 @@ class TorchScenes:
     """Implements hgn.training.pushforward.SimulatedScenes."""
 
     def __init__(self, network: ParticleNetwork, stopped: Callable[[], bool] = lambda: False) -> None:
-        """`network` computes the simulations. `stopped` is asked after each frame."""
+        """`network` computes the simulations. `stopped` is called after each frame."""
         self._network, self._backend, self._stopped = network, fastest_stepped(network), stopped
         self._backend.step = network.step.in_training
 

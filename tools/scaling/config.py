@@ -16,10 +16,8 @@ class ScalingConfig(ReportConfig):
     scenes: OneOrMore = 8  # on each device
     particles: OneOrMore = 4_296  # of a scene, on average
     batches: OneOrMore = 8  # of each device; a sample is one update on each batch
-    backends: tuple[Annotated[str, one_of("torch", "triton")], ...] = (
-        "torch",
-        "triton",
-    )  # of training; triton is skipped without GPUs
+    # of training; triton is skipped without GPUs
+    backends: tuple[Annotated[str, one_of("torch", "triton")], ...] = ("torch", "triton")
     precision: Precision = "tf32"  # or fp32, fp16 (backend triton; backend torch then takes tf32)
     network: NetworkConfig = field(default_factory=NetworkConfig)  # that is trained
     # after which contenders are sampled no more, but five times at least and 20 times at most
