@@ -225,9 +225,8 @@ def near_name(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def near_file(path: Path) -> str:
-    """Returns `did you mean NAME?` for a similar file in the folder of `path`, or an empty text."""
-    ending = path.suffix.replace("yml", "yaml")[:3]
-    names = {each.name for each in path.parent.glob("*") if each.suffix.replace("yml", "yaml")[:3] == ending}
+    """Returns `did you mean NAME?` for a file of similar name and ending in the folder of `path`, or an empty text."""
+    names = {each.name for each in path.parent.glob("*") if near_name(each.suffix, [path.suffix])}
     return near_name(path.name, names - {path.name}, 0.8)
 
 
@@ -353,6 +352,8 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
         if value is None and type(None) in arguments:
             return None
         options = [option for option in arguments if option is not type(None)]
+        if isinstance(value, (list, tuple)):
+            options = [option for option in options if _shape(option)[0] is tuple] or options
         if len(options) == 1:
             return _convert(options[0], value, path)
         for option in options:
@@ -360,7 +361,7 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
                 return _convert(option, value, path)
             except ConfigError:
                 continue
-        raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {_shown.repr(value)}")
+        raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {_shown.repr(value)}{_unquoted(hint, value)}")
     if is_dataclass:
         return from_mapping(hint, value, path)
     if origin is tuple:
@@ -389,9 +390,20 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
         return float(value)
     if hint in (bool, int, str) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool):
         return value
-    raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {_shown.repr(value)} ({type(value).__name__})")
+    seen = f"{_shown.repr(value)} ({type(value).__name__})"
+    raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {seen}{_unquoted(hint, value)}")
 
 
 def _name(hint: Any) -> str:
-    names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
-    return names.get(hint, str(hint))
+    """Returns the words for a type in messages."""
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "text", type(None): "null"}
+    origin, arguments, _ = _shape(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(_name, arguments))
+    return f"a list of {len(arguments)} values" if origin is tuple else names.get(hint, str(hint))
+
+
+def _unquoted(hint: Any, value: Any) -> str:
+    """Returns the remedy for a number in quotes, or an empty text."""
+    quoted = hint is not bool and isinstance(value, str) and re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?", value)
+    return "; write it without quotes" if quoted else ""

@@ -109,9 +109,9 @@ def load_bodies(
 @np.errstate(all="ignore")  # numbers that are not finite are refused
 def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     if not is_mesh_file(path):
-        raise ConfigError(
-            f"{field} must end in one of {', '.join((*MESH_SUFFIXES, *USD_ENDINGS))}, got {path}; convert the mesh"
-        )
+        endings = ", ".join((*MESH_SUFFIXES, *USD_ENDINGS))
+        remedy = "convert the mesh" if path.is_file() else near_file(path) or "convert the mesh"
+        raise ConfigError(f"{field} must end in one of {endings}, got {path}; {remedy}")
     if not path.is_file():
         remedy = near_file(path) or f"there is none at {path.absolute()}"
         raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")

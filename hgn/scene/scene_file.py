@@ -252,7 +252,9 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """Reads the YAML of a scene file. Raises: ConfigError, starting with the path."""
     path = Path(path)
     if not path.is_file():
-        raise ConfigError(f"scene must be an existing YAML file, got {path}; {near_file(path)}".removesuffix("; "))
+        others = ", ".join(sorted(each.name for each in path.parent.glob("*.y*ml") if each.is_file()))
+        remedy = near_file(path) or (others and f"YAML files there: {others}")
+        raise ConfigError(f"scene must be an existing YAML file, got {path}; {remedy}".removesuffix("; "))
     mapping = read_yaml(path)
     require(isinstance(mapping, dict), f"{path}: the file", "a mapping of keys to values, such as groups", mapping)
     return dict(mapping)

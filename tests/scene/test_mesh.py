@@ -189,6 +189,17 @@ def test_bad_files_and_numbers_are_refused_by_name(tmp_path, name, content, opti
         load_mesh(tmp_path / name, "ramp", **options)
 
 
+@pytest.mark.parametrize("name", ["ramp.objj", "ramp.ob", "ramp.ojb", "rampp.obj"])
+def test_a_mistyped_mesh_is_answered_with_the_file(tmp_path, name):
+    """The similar mesh of the folder, also where the ending is mistyped; not where a file of that name exists."""
+    (tmp_path / "ramp.obj").write_bytes(GOOD)
+    with pytest.raises(ConfigError, match=rf"{name}; did you mean ramp\.obj\?$"):
+        load_mesh(tmp_path / name)
+    (tmp_path / "ramp.objj").touch()
+    with pytest.raises(ConfigError, match=r"ramp\.objj; convert the mesh$"):
+        load_mesh(tmp_path / "ramp.objj")
+
+
 STEPS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 0 0 1\nf 1 2 4\n"
 
 

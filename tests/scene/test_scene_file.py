@@ -298,6 +298,10 @@ MISTAKES = [
     (obstacle_with(shape=None, mesh="a.obj"), OBSTACLE + r"\.size must be left out beside mesh"),
     (obstacle_with(scale=0, **MESH), OBSTACLE + r"\.scale must be a finite"),
     (obstacle_with(**MESH), OBSTACLE + r"\.mesh must be an existing file"),
+    (group_with(size="wide"), "size must be a number or a list of 3 values or null, got 'wide'$"),
+    *((group_with(size=size), r"0\]\.size\S* must .*; write it without quotes$") for size in ("0.1", [".1", 0.1, 0.1])),
+    (group_with(position=["+5", 0, 0]), r"n\[0\] must be a number, got '\+5' \(str\); write it without quotes$"),
+    (scene_with(seed="-5"), r"seed must be a whole number, got '-5' \(str\); write it without quotes$"),
 ]
 
 
@@ -434,11 +438,12 @@ def test_stored_particles_inside_an_obstacle(tmp_path, inside):
 
 
 def test_a_mistyped_file_name_is_answered_with_the_file(tmp_path):
-    """The nearest YAML file of the folder; nothing where none is near, or where there is no folder."""
+    """The nearest YAML file of the folder, or all of them where none is near; nothing where there is no folder."""
     (tmp_path / "my_scene.yaml").write_text("groups: []")
     with pytest.raises(ConfigError, match=r"got .*my_sceen\.yaml; did you mean my_scene\.yaml\?$"):
         load_scene(tmp_path / "my_sceen.yaml")
     os.mkfifo(tmp_path / "pipe.yaml")
-    for absent in (tmp_path / "funnel.yaml", tmp_path / "nowhere" / "my_scene.yaml", tmp_path / "pipe.yaml"):
-        with pytest.raises(ConfigError, match=rf"got {absent}$"):
-            load_scene(absent)
+    others = "; YAML files there: my_scene.yaml"
+    for name, remedy in (("funnel.yaml", others), ("pipe.yaml", others), ("nowhere/my_scene.yaml", "")):
+        with pytest.raises(ConfigError, match=rf"got {tmp_path / name}{remedy}$"):
+            load_scene(tmp_path / name)
