@@ -1,7 +1,7 @@
 """Runs all commands: Hydra composes the config, and errors that a user can mend end in one line.
 
 Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input (also a pipe or
-device in place of a file or folder), 130 Ctrl-C, 141 closed output pipe (as in `… | head`).
+device in place of a file or folder), 130 Ctrl-C, 143 SIGTERM, 141 closed output pipe (as in `… | head`).
 """
 
 import atexit
@@ -134,8 +134,8 @@ def _exit_code(main: Main | str, config_name: str) -> int:
         if not memory_is_full(error):
             raise
         code = _fail(f"memory is full ({error}); take smaller input or another machine", EXIT_MACHINE)
-    except KeyboardInterrupt:
-        code = _fail("interrupted", EXIT_INTERRUPTED)
+    except KeyboardInterrupt as interruption:  # by Ctrl-C, or with the number of another signal
+        code = _fail("interrupted", 128 + interruption.args[0] if interruption.args else EXIT_INTERRUPTED)
     return code
 
 

@@ -5,7 +5,6 @@ Prints the page's address, which contains a token. Ctrl-C ends the program.
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import webbrowser
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from hgn.schema import FileName, Port, Positive, from_mapping, require, require_
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
 from hgn.system.loading import loading
+from hgn.system.processes import ended_as_by_ctrl_c
 
 if TYPE_CHECKING:
     from hgn.runtime.simulator import Simulator
@@ -51,12 +51,15 @@ def main(mapping: dict[str, Any]) -> int:
     if config.html is not None:
         return _write_page(config)
     page = film_page(config) if config.rollout is not None else play_page(config)
-    print(page.address, flush=True)
-    if config.browser:
-        webbrowser.open(page.address)
     try:
-        with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the normal end
+        with ended_as_by_ctrl_c():
+            print(page.address, flush=True)
+            if config.browser:
+                webbrowser.open(page.address)
             page.run()
+    except KeyboardInterrupt as interruption:
+        if interruption.args:  # another signal; Ctrl-C is the normal end
+            raise
     finally:
         page.close()
     return 0

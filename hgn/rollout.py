@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hgn.command import require_rollout_name, run_command
+from hgn.command import ROLLOUT_ENDINGS, require_rollout_name, run_command
 from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig
 from hgn.render import PLY_ENDING
 from hgn.scene.distance import fraction_inside, outside_domain
@@ -114,6 +114,8 @@ def main(mapping: dict[str, Any]) -> int:
         with bar("drawing", total=len(range(0, result.frame_count, every)), unit="picture") as progress:
             animate(result, moving, every=every, progress=lambda *_: progress.update())
         print(moving)
+    elif config.render is None and out.suffix in ROLLOUT_ENDINGS:
+        print(f"render=true also draws it, or python -m tools.render rollout={path} out=pictures", file=sys.stderr)
     return 0
 
 
@@ -139,12 +141,12 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     source: dict[str, str | int] = {"weights": weights.name, "weights_sha256": digest}
     frames = config.frames
     reference_TN3 = scene = None
+    notes: list[str] = []
     if config.data is None:
         scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
-        for note in (*notes_on_files(scene), *_notes_on_physics(scene, simulator.info, weights.stem)):
-            print(note, file=sys.stderr)
+        notes = [*notes_on_files(scene), *_notes_on_physics(scene, simulator.info, weights.stem)]
         source["scene"] = config.scene or f"random, seed {config.random_seed}"
     else:
         from hgn.data.reader import find_episode
@@ -157,6 +159,9 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(printable(config.data)).name, "episode": str(config.episode)}
+    simulated = simulator.frames(initial, frames)  # before all notes, because it refuses unsupported scenes
+    for note in notes:
+        print(note, file=sys.stderr)
     limit, relative = simulator.info.maximum_initial_speed, simulator.info.network.relative
     fastest = float(np.linalg.norm(initial.velocity_N3.astype(np.float64), axis=-1).max(initial=0.0))
     if not (relative and limit is None) and fastest > (limit or 0.0) * (1 + SAME_SPEED):
@@ -184,8 +189,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         materials=initial.materials,
         dimensions=initial.dimensions,
     )
-    with closing(_shown(simulator.frames(initial, frames), frames, weights)) as simulated:
-        written = save_frames(out, result, simulated, config.surface)
+    with closing(_shown(simulated, frames, weights)) as shown:
+        written = save_frames(out, result, shown, config.surface)
     return written, result
 
 
@@ -207,11 +212,10 @@ def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator
     inputs = info.network.own_physics
     used = INPUT_PARAMETERS if "parameters" in inputs else ()
     if unused := ", ".join(name for name in scene.material_parameters if name not in used):
-        yield f"not used: {unused} of groups, which are the solver's; {weights} knows one of each material"
+        yield f"no effect: {unused} of groups; {weights} simulates each material with the solver's constants"
     frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
     if frictions.any() and "friction" not in inputs:
-        known = f"{weights} knows that of its data alone; weights=own_physics has it as input"
-        yield f"not used: friction of surfaces, which is the solver's; {known}"
+        yield f"no effect: friction of surfaces; {weights} has that of its data, and own_physics has it as input"
     speeds = np.array([obstacle.motion.fastest(obstacle.vertex_V3) for obstacle in scene.obstacles if obstacle.motion])
     for name, (low, high) in info.own_ranges.items():
         own = {"friction": frictions, "moving": speeds}

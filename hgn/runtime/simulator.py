@@ -295,12 +295,14 @@ class Simulator:
         """Yields positions float32 [N, 3] of `count` frames, without end by default, starting with the initial ones.
 
         Backend triton computes some frames ahead. Several scenes may be simulated at the same time by separate calls.
-        Raises: ConfigError with the first frame; DivergedError after the last good frame.
+        Raises: ConfigError as `start`, before the first frame is taken; DivergedError after the last good frame.
         """
         require_count("count", count, 1)
         states = initial_states([scene])
         entries = self._entries(states)
-        state = self.start(states)
+        return self._frames(self.start(states), entries, count)
+
+    def _frames(self, state: ParticleState, entries: Sequence[Entry], count: int) -> Iterator[np.ndarray]:
         yield state.position_N3.cpu().numpy()
         capacity = len(state.position_N3) + sum(len(entry.state.position_N3) for entry in entries)
         with self.simulation(state, capacity, entries=entries) as simulation:

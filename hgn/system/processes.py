@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any, BinaryIO
+from types import FrameType
+from typing import Any, BinaryIO, NoReturn
 
 PR_SET_PDEATHSIG = 1  # from linux/prctl.h
 
@@ -22,9 +23,13 @@ def die_with_parent(number: int) -> None:
 
 @contextlib.contextmanager
 def ended_as_by_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM and SIGHUP raise KeyboardInterrupt, as Ctrl-C does. Ignored ones (nohup) stay ignored."""
+    """Lets SIGTERM and SIGHUP raise KeyboardInterrupt with their number. Ignored ones (nohup) stay ignored."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt(number)
+
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    before = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield
     finally:

@@ -10,8 +10,8 @@ import pytest
 from end_to_end.places import COMMANDS, EVALUATE, OF_THE_RUN, ROLLOUT, content, refused
 from processes import exit_code
 
-from hgn import rollout
-from hgn.command import EXIT_INPUT, EXIT_INTERRUPTED, EXIT_MACHINE
+from hgn import play, rollout
+from hgn.command import EXIT_INPUT, EXIT_MACHINE
 from hgn.runtime.simulator import Simulator
 from hgn.scene.rollout_file import read_rollout
 
@@ -103,6 +103,26 @@ def test_own_files_are_replaced(place, monkeypatch):
         assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_page_is_closed_by_signals(number, capsys, monkeypatch):
+    """Ctrl-C is the normal end of hgn.play; other signals end it with their exit code and a line."""
+
+    class Page:
+        address = "http://127.0.0.1/"
+
+        def run(self):
+            signal.raise_signal(number)
+
+        def close(self):
+            print("closed")
+
+    monkeypatch.setattr(play, "play_page", lambda config: Page())
+    code = exit_code(play.main, "play", ["browser=false"], monkeypatch)
+    normal = number == signal.SIGINT
+    assert code == (0 if normal else 128 + number)
+    assert capsys.readouterr() == (f"{Page.address}\nclosed\n", "" if normal else "error: interrupted\n")
+
+
 @pytest.mark.parametrize(
     ("name", "number"), [("a.vtkhdf", signal.SIGINT), ("a.vtkhdf", signal.SIGTERM), ("a.ply", signal.SIGHUP)]
 )
@@ -118,7 +138,7 @@ def test_an_interrupted_simulation_keeps_its_frames(place, name, number, capsys,
 
     monkeypatch.setattr(Simulator, "frames", interrupted)
     code, line = refused("rollout", ["scene=scene.yaml", f"out=made/{name}", "frames=50"], capsys, monkeypatch)
-    assert code == EXIT_INTERRUPTED and line == "error: interrupted"
+    assert code == 128 + number and line == "error: interrupted"
     names = sorted(path.name for path in place.path("made").iterdir())
     if name == "a.vtkhdf":
         assert names == [name] and read_rollout(place.path("made") / name).frame_count == 3

@@ -103,7 +103,8 @@ def test_scenes(tmp_path, weights, small_pictures, monkeypatch):
 
 def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     """A network knows one water and one friction; a scene file's are the solver's, and a line says so. Others say which
-    of its meshes is no solid, which lies outside of the domain, in millimetres say, and which within a cell."""
+    of its meshes is no solid, which lies outside of the domain, in millimetres say, and which within a cell. The last
+    line says how to draw the file."""
     (tmp_path / "open.obj").write_text("v 0.2 0.2 0.2\nv 0.4 0.2 0.2\nv 0.2 0.2 0.4\nf 1 2 3\n")
     obstacles = "{shape: square, size: 0.1, position: [0.8, 0.2, 0.5], friction: 0.2}, {mesh: open.obj}"
     obstacles += ", {mesh: open.obj, scale: 200, position: [500, 0, 0]}, {mesh: open.obj, scale: 0.01}"
@@ -112,11 +113,21 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     out = str(tmp_path / "a.vtkhdf")
     assert rollout.main({"weights": weights, "frames": 2, "scene": str(tmp_path / "stiff.yaml"), "out": out}) == 0
     said = capsys.readouterr().err
-    assert "not used: youngs_modulus_pa of groups" in said
+    assert "no effect: youngs_modulus_pa of groups; still simulates each material with the solver's" in said
     assert "a sheet, not a solid, because it is not watertight: open.obj; close its" in said and "square" not in said
-    assert "not used: friction of surfaces, which is the solver's; still knows that of its data alone" in said
+    assert "no effect: friction of surfaces; still has that of its data, and own_physics has it as input" in said
     assert said.count("outside the domain, out of reach of particles: open.obj (x 540 to 580, y 40 to 40") == 1
+    assert said.endswith(f"\nrender=true also draws it, or python -m tools.render rollout={out} out=pictures\n")
     assert said.count("smaller than a cell of 0.0156: open.obj (x 0.002 to 0.004, ") == 1
+
+
+def test_what_weights_do_not_support_is_refused_before_notes(tmp_path, weights, capsys):
+    """An elastic group for other weights: neither notes on the scene nor progress bars come before the error."""
+    group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: elastic, youngs_modulus_pa: 1e5}"
+    (tmp_path / "a.yaml").write_text(f"groups: [{group}]\nfloor_friction: 0.5\n")
+    with pytest.raises(ConfigError, match="elastic"):
+        rollout.main({"weights": weights, "scene": str(tmp_path / "a.yaml"), "out": str(tmp_path / "a.vtkhdf")})
+    assert capsys.readouterr() == ("", "")
 
 
 def test_particles_out_of_place_are_reported(tmp_path, weights, capsys):

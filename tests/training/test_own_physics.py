@@ -104,4 +104,4 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     said = capsys.readouterr().err
     assert "friction: 1.5, those of the data of own are 0 to 1; motion is a guess" in said
     assert "sand_friction_angle_deg: 60, those of the data of own are 15 to 45" in said
-    assert "not used: poisson_ratio of groups" in said and "not used: friction" not in said
+    assert "no effect: poisson_ratio of groups" in said and "no effect: friction" not in said
