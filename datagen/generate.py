@@ -32,7 +32,7 @@ _OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
 
 class StopSignal:
-    """Notes the first Ctrl-C or SIGTERM, so that current writes are finished. A second one ends the process."""
+    """Records the first Ctrl-C or SIGTERM, so that current writes are finished. A second one ends the process."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -72,7 +72,7 @@ def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> Da
     if not weights:
         return config
     require(isinstance(weights, list), "frozen", "a list of weights files, as in [a.safetensors]", weights)
-    require(config.dataset.seed == 0, "dataset.seed", "left out with frozen: it is drawn", config.dataset.seed)
+    require(config.dataset.seed == 0, "dataset.seed", "left out with frozen, which draws it", config.dataset.seed)
     require_local_folder(config)
     seed = draw_fresh(config.dataset.folder, weights).seed
     return replace(config, dataset=replace(config.dataset, seed=seed))
@@ -93,7 +93,7 @@ def generate(
 ) -> bool:
     """Generates the missing episodes. Returns False after a stop request; the same folder can be resumed.
 
-    early: a GPU begins with few scenes, because a reader waits for the first episodes. The whole run then takes longer.
+    With `early` a GPU starts with few scenes, because a reader waits for the first episodes; the run takes longer.
     Raises: ConfigError, OSError, RuntimeError. Published and staged episodes are kept in every case.
     """
     require_local_folder(config)
@@ -106,7 +106,7 @@ def generate(
             except Stopped:
                 progress.message(
                     f"stopped; {writer.done} of {writer.total} episodes are kept in {writer.folder}: run the same "
-                    "command to resume; only scenes in the middle of their simulation begin anew"
+                    "command to resume; only interrupted simulations start again"
                 )
                 return False
         progress.message(_summary(config, writer))
@@ -126,5 +126,5 @@ def _summary(config: DatagenConfig, writer: DatasetWriter) -> str:
     counts = ", ".join(f"{writer.manifest.published(split)} {split}" for split in writer.requested)
     task, tasks = config.dataset.array_task, config.dataset.array_tasks
     if task is not None and not writer.manifest.complete:
-        return f"share {task} of {tasks} of {writer.folder} is complete; published so far: {counts} episodes"
+        return f"part {task} of {tasks} of {writer.folder} is complete; published so far: {counts} episodes"
     return f"{writer.folder} is complete: {counts} episodes"

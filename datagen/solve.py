@@ -65,7 +65,7 @@ def solved(scene: Scene, config: SolveConfig, file: Path) -> Rollout:
         shown = lambda frame: advance_to(progress, frame + 1)  # noqa: E731
         (result,) = simulate([scene], config.mpm, config.frames, rate_hz, on_frame=shown)
     if isinstance(result, SceneFailure):
-        raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
+        raise ConfigError(f"{file} must be a scene that the solver can simulate, got {result.cause}")
     return Rollout(
         result.position_TN3, scene.material_N, scene.obstacles, scene.domain_size, rate_hz,
         gravity=scene.gravity, cell_size=scene.cell_size,

@@ -29,11 +29,11 @@ def main(mapping: dict[str, Any]) -> int:
     """Copies the data set. The exit code is 0, or 128 + the signal that stopped it."""
     config = from_mapping(UploadConfig, mapping)
     require(is_remote(config.to), "to", "a URL", config.to, "as in to=s3://bucket/obstacles")
-    require(not is_remote(config.data), "data", "a folder of this machine", config.data)
+    require(not is_remote(config.data), "data", "a local folder", config.data)
     with StopSignal() as stop:
         target = Target(config.to)
         target.copy(Path(config.data), stop)
-    print(printable(f"{config.to} holds {target.shards} shards") + (", the whole data set" if target.complete else ""))
+    print(printable(f"{config.to} has {target.shards} shards") + (", the whole data set" if target.complete else ""))
     return 0 if stop.signal is None else 128 + stop.signal
 
 
@@ -93,11 +93,11 @@ class Target:
 
     def _require_beginning(self, there: Manifest, manifest: Manifest) -> None:
         if there.config_hash != manifest.config_hash:
-            raise ConfigError(f"to must be empty or hold the same data set, got another one in {self._url}")
+            raise ConfigError(f"to must be empty or contain the same data set, got another one in {self._url}")
         if not all(manifest.shards.continues(there.shards, split) for split in SPLITS):
             raise ConfigError(
-                f"to must hold shards that the data set here begins with, got others in {self._url}; was it generated "
-                "anew? choose another URL"
+                f"to must contain the first shards of the local data set, got others in {self._url}; if it was "
+                "generated again, choose another URL"
             )
 
 

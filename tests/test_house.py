@@ -17,7 +17,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_075,
-    "datagen": 8_939,
+    "datagen": 8_937,
     "tools": 6_352,
     "tests": 34_789,
 }

@@ -39,7 +39,7 @@ class Body:
     bearing: float  # height above a thin closed body up to which nodes stop motion
     origin_3: np.ndarray  # float64, from the origin to the pivot of the motion
     shape: tuple[int, int, int]  # number of cells along each axis of the frame
-    # float32 [S, 3, 3]: the vector from the closest point of the surface, without its part along a sheet beyond a rim;
+    # float32 [S, 3, 3]: the vector from the closest surface point, without its part along a sheet beyond the rim;
     # the normal, outward or of the nearest triangle; and for closed bodies the height above the surface and 1 at
     # thin places, for sheets the distance along the sheet from its rim and 1 where the rim is nearest
     sample_S33: np.ndarray
@@ -166,6 +166,6 @@ def require_slow(scenes: Sequence[Scene], frame_rate_hz: float) -> None:
                 way <= MAXIMUM_MOVE_CELLS,
                 f"obstacles[{number}].keyframes of scene {index}",
                 f"no faster than {MAXIMUM_MOVE_CELLS:g} cells a frame",
-                f"{way:.4g} from {float(key_TK[fastest, KEY.time]):.4g} s on",
-                "give it more time",
+                f"{way:.4g} after {float(key_TK[fastest, KEY.time]):.4g} s",
+                "move it more slowly",
             )

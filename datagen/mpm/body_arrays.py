@@ -1,8 +1,8 @@
 """Arrays of a launch's moving obstacles for kernels (datagen.mpm.body_kernel).
 
-`contact` gets the first second field of each scene with moving sheets, -1 for other scenes (SHAPE.second_fields); the
-place of the first head of each scene, and the end (SHAPE.bodies); the heads (layout.BodyHead); and for each obstacle
-the table of lists by base node in its frame (-1: none), then these lists (see surface_kernel.LIST_HEAD).
+`contact` contains, in this order: the first of each scene's second fields, or -1 without moving sheets
+(SHAPE.second_fields); the place of each scene's first head, and the end of the heads (SHAPE.bodies); the heads
+(layout.BodyHead); for each obstacle a table of its lists by base node (-1: none), and the lists (see LIST_HEAD).
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ def body_arrays(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the part of `contact` from first_place on, that of `contact_normal` from first_vector on, and `pose`.
 
-    All arguments but the last two have an entry for each scene; `frictions` are those of all its obstacles.
+    All arguments except the last two have one entry for each scene; `frictions` contains those of all its obstacles.
     """
     counts = [len(own) for own in bodies]
     begins = first_place + 2 * len(counts) + 1 + HEAD.length * np.concatenate([[0], np.cumsum(counts)])
@@ -65,12 +65,12 @@ def body_arrays(
 
 
 def list_begins(sweep: Sweep) -> np.ndarray:
-    """Returns the begins of a sweep's lists in `triangle_lists`, int32."""
+    """Returns the starts of a sweep's lists in `triangle_lists`, int32."""
     return (sweep.begin_K + LIST_HEAD * np.arange(len(sweep.begin_K))).astype(np.int32)
 
 
 def triangle_lists(sweep: Sweep, first_vector: int) -> np.ndarray:
-    """Returns the lists of a sweep with their heads, int32. The triangles' vectors begin at first_vector."""
+    """Returns the lists of a sweep with their heads, int32. The triangles' vectors start at first_vector."""
     count = np.diff(np.append(sweep.begin_K, len(sweep.triangle_L)))
     head = list_begins(sweep)
     lists = np.empty(LIST_HEAD * len(count) + len(sweep.triangle_L), np.int32)

@@ -11,7 +11,7 @@ from datagen.mpm.collider import GAP_CELLS
 from datagen.mpm.layout import HEAD, KEY, SETTING, SHAPE, STATE, VALUE
 from datagen.mpm.surface_samples import BEARING_CELLS
 
-AXES = 3  # from a pose's begin to its axes
+AXES = 3  # from the start of a pose to its axes
 SAMPLE_VECTORS = 3  # see Body.sample_S33
 ON_SURFACE = 1e-3  # distance from the surface below which the direction to it is rounding, cells
 
@@ -35,7 +35,7 @@ def first_body(scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def into_frame(place, pose: ti.i32, state: ti.i32, arrays: ti.template()):
-    """Returns a place in the frame of a body. `pose` is the begin of the pose in `arrays.pose`."""
+    """Returns a place in the frame of a body. `pose` is the start of the pose in `arrays.pose`."""
     offset = place - _vector(pose, arrays)
     return _vector(state + STATE.origin, arrays) + ti.Vector(
         [offset.dot(_vector(pose + AXES + 3 * axis, arrays)) for axis in range(3)]
@@ -111,7 +111,7 @@ def _place_body(state: ti.i32, keys: ti.i32, time: ti.f32, arrays: ti.template()
 def move_bodies(scene: ti.i32, arrays: ti.template()):
     """Moves a scene's bodies to the end of the substep that was chosen. One thread calls it for each substep.
 
-    An interval begins in the pose in which the last one ended, bitwise. Velocities are those in its middle.
+    An interval starts with the last pose of the previous one, bitwise. Velocities are those in its middle.
     """
     step = arrays.scene_value[scene, VALUE.time_step]
     time = arrays.scene_value[scene, VALUE.frame_end] - arrays.scene_value[scene, VALUE.remaining]
@@ -146,7 +146,7 @@ def move_bodies(scene: ti.i32, arrays: ti.template()):
 
 @ti.func
 def _sampled(place, vector: ti.template(), head: ti.i32, arrays: ti.template()):
-    """Returns one of the vectors of a body's samples, interpolated at a place between samples (in their spacings)."""
+    """Returns one of the vectors of a body's samples, interpolated at a place in units of their spacing."""
     base = ti.floor(place, ti.i32)
     fraction = place - ti.cast(base, ti.f32)
     size_y, size_z = arrays.contact[head + HEAD.shape + 1], arrays.contact[head + HEAD.shape + 2]

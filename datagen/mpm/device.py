@@ -50,11 +50,11 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     if _started is not None:
         if device not in ("auto", _started.kind):
             raise ConfigError(
-                f"device must stay {_started.kind} in a process that began with it, got {device!r}; use another process"
+                f"device must stay {_started.kind} for the whole process, got {device!r}; use another process"
             )
         if _started.kind == "cpu" and cpu_threads not in (None, _started.threads):
             raise ConfigError(
-                f"cpu_threads must stay {_started.threads} in a process that began with it, got {cpu_threads}; "
+                f"cpu_threads must stay {_started.threads} for the whole process, got {cpu_threads}; "
                 "use another process"
             )
         return _started
@@ -62,7 +62,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     ti.set_logging_level(ti.ERROR)  # without a GPU the search for CUDA warns
     has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
     if device == "cuda" and not has_gpu:
-        raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'cuda'")
+        raise ConfigError("device must be cpu or auto if CUDA finds no device, got 'cuda'")
     threads = cpu_threads or available_cpus()
     # if Taichi cannot write to its cache, it crashes at the end of the process
     kernels = writable_folder(Path(ti.lang.impl.default_cfg().offline_cache_file_path), "taichi")
@@ -90,7 +90,7 @@ def _processors() -> int:
     multiprocessors, device = 16, 0
     status = cuda_driver().cuDeviceGetAttribute(ctypes.byref(count), multiprocessors, device)
     if status != 0:
-        raise ConfigError(f"device must be one that CUDA tells about, got error {status}; choose cpu")
+        raise ConfigError(f"device must be a GPU that CUDA can query, got error {status}; choose cpu")
     return count.value
 
 
@@ -101,7 +101,7 @@ def memory_bytes(device: Device) -> int:
     size = ctypes.c_size_t()
     status = cuda_driver().cuDeviceTotalMem_v2(ctypes.byref(size), 0)
     if status != 0:
-        raise ConfigError(f"device must be one whose memory CUDA reports, got error {status}; choose cpu")
+        raise ConfigError(f"device must be a GPU whose memory CUDA can query, got error {status}; choose cpu")
     return size.value
 
 

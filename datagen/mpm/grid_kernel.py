@@ -185,8 +185,8 @@ def substep(
     """Advances every scene with remaining time by one substep of its own length.
 
     Particles that enter later belong to an additional row of scene_value, which never has time.
-    Order: time step; in the first substep of an interval marks of blocks; particles to grid (deformation, plasticity,
-    stress), gravity, colliders, walls; in the last substep grid to particles and advection.
+    Order: time step; marks of blocks (first substep of an interval); particles to grid (deformation, plasticity,
+    stress); gravity, colliders, walls; grid to particles and advection (last substep of an interval).
 
     label    scene and material of each particle
     node     [scenes * blocks * 64] velocity and mass of nodes
@@ -197,7 +197,7 @@ def substep(
              the list is built again, and the marks of own_step
     contact  entry of each node or -1: the place of its vectors in `contact_normal` (see surface_kernel.NODE_VECTORS),
              and if below SHAPE.ghosts the place of its second field after SHAPE.ghost_begin. Then for each base node
-             the begin of its list of triangles in `contact`, or -1; then these lists with their heads (see
+             the start of its list of triangles in `contact`, or -1; then these lists with their heads (see
              surface_kernel.LIST_HEAD), which contain places of triangles' vectors in `contact_normal`. Then the
              moving obstacles (see body_arrays)
     pose     numbers of moving obstacles (see layout.BodyState)

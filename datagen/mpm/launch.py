@@ -138,7 +138,7 @@ class Launch(ABC):
         nodes = self.all_blocks * BLOCK_NODES * self.copies
         if max(nodes * self.entries_a_node, self.particles) >= 2**31:
             raise ConfigError(
-                f"a batch must hold less than {2**31 // self.entries_a_node} nodes and {2**31} particles, got {nodes} "
+                f"a batch must have less than {2**31 // self.entries_a_node} nodes and {2**31} particles, got {nodes} "
                 f"nodes of {len(scenes)} scenes and {self.particles} particles; lower scenes_per_launch"
             )
         label = np.concatenate(
@@ -327,7 +327,7 @@ class Launch(ABC):
         end = 2 * all_nodes + sum(LIST_HEAD * len(sweep.begin_K) + len(sweep.triangle_L) for sweep in sweeps)
         if end >= 2**31:
             raise ConfigError(
-                f"a batch must hold less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
+                f"a batch must have less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
                 "scenes_per_launch"
             )
         places, values, end, triangle = list[np.ndarray](), list[np.ndarray](), 2 * all_nodes, 0

@@ -26,10 +26,10 @@ class Constant(NamedTuple):
     density: int = 2
     sand_alpha: int = 3  # slope of the Drucker-Prager cone
     hardening: int = 4
-    snow_smallest: int = 5  # smallest and largest singular value that snow bears elastically
+    snow_smallest: int = 5  # smallest and largest singular value of elastic snow
     snow_largest: int = 6
     maximum_hardening: int = 7
-    mass: int = 8  # (mass of a particle) / (its mass with the config's density)
+    mass: int = 8  # (mass of a particle) / (its mass at the config's density)
     sand_sine: int = 9  # sine of the friction angle
     water_tension: int = 10  # fraction of the tension that stretched water bears
     viscosity: int = 11  # viscosity of water, Pa s
@@ -154,7 +154,7 @@ class BodyHead(NamedTuple):
     """Positions in the integers of a moving obstacle."""
 
     closed: int = 0
-    state: int = 1  # begin of its numbers in the array `pose`: see BodyState
+    state: int = 1  # start of its numbers in the array `pose`: see BodyState
     keys: int = 2  # number of keyframes
     samples: int = 3  # place of the first sample in `contact_normal`
     shape: int = 4  # 4, 5, 6: number of samples along the axes

@@ -123,9 +123,9 @@ def own_step(
     5. the new `spread`
     6. the time of stress in this substep: the substep if the new `spread` is 1, else the acting time after `covered`
 
-    In a synchronised interval a stress computed at time t acts from half a step before t to half a step after t. The
-    stresses of the interval's begin and end act for half a step. The remaining time of strain is divided into equal
-    steps. They are as long as the particle's stiffness allows, rounded down to substeps. `alike` is the number of
+    In a synchronised interval a stress computed at time t acts from half a step before t to half a step after t.
+    Stresses at the start and end of the interval act for half a step. The remaining time of strain is divided into
+    equal steps. They are as long as the particle's stiffness allows, rounded down to substeps. `alike` is the number of
     substeps in each of these steps; particles with the same `alike` have the same steps. In intervals that are not
     synchronised, and in the last substep of every interval, a step is one substep.
     """

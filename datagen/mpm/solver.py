@@ -74,16 +74,16 @@ def simulate(
     Scenes with emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
     called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.
     `cpu_threads` applies to the process's first simulation (see `initialise`). `colliders` are results of
-    `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: chosen by
-    device and scenes. `stability_fractions` replace the config's. Results contain the first of each
-    `children` particles (see datagen.fine); counters count all particles.
+    `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: it is
+    chosen by device and scenes. `stability_fractions` replace the config's. Results contain the first of each
+    `children` particles (see datagen.fine); counters include all particles.
 
     On a CPU a scene's result does not depend on its batch, bitwise. `cpu_threads` changes it only through the number of
     partial sums, min(cpu_threads, 4). On a GPU sums have no fixed order.
 
     A particle with an entry time is NaN before it; it enters in free flight from its given place. A scene that is not
-    finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame. A
-    scene without particles has [frames, 0, 3].
+    finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame.
+    The result of a scene without particles has shape [frames, 0, 3].
 
     Raises: ConfigError for scenes that do not share a grid, particles outside the walls, obstacles that are not finite,
     fewer than one frame, or a missing device.
@@ -113,7 +113,7 @@ def simulate(
     step_s = config.fixed_time_step_s
     moving = any(scenes[i].moves for i in occupied)
     require_slow(scenes, frame_rate_hz)
-    require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
+    require(not moving or step_s is None, "fixed_time_step_s", "null if obstacles move", step_s)
     _require_memory(device, [scenes[i] for i in occupied], node_counts)
     single = [i for i in occupied if scenes[i].emits]  # particles enter between launches of single substeps
     groups = [group for group in ([i for i in occupied if i not in single], single) if group]
@@ -150,9 +150,9 @@ def _launched(
                 return _run(TeamLaunch(team, _teams_at_once(device, team), *batch), frames, on_frame, children)
             except BlocksApartError:
                 warnings.warn(
-                    f"the {device.kind} does not run {team.blocks} blocks of {team.threads} threads at once, which "
-                    "share a scene: scenes take one launch a substep, which is slower; leave the device to this "
-                    "process alone", RuntimeWarning, stacklevel=3,
+                    f"the {device.kind} does not run the {team.blocks} blocks of {team.threads} threads of a scene "
+                    "concurrently, so each substep is a separate launch, which is slower; end other programs on the "
+                    "device", RuntimeWarning, stacklevel=3,
                 )  # fmt: skip
         return _run(GridLaunch(device, *batch), frames, on_frame, children)
 
@@ -234,7 +234,7 @@ def _blocks_at_once(device: Device) -> int:
 def _teams_at_once(device: Device, team: Team) -> int:
     """Returns the number of teams that run concurrently. Blocks of a team wait for each other."""
     room = _blocks_at_once(device)
-    require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
+    require(team.blocks <= room, "team.blocks", f"at most {room}, which can run concurrently", team.blocks)
     return room // team.blocks
 
 
@@ -246,7 +246,7 @@ def _largest_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int,
         if scene.cell_size != first.cell_size:
             raise ConfigError(
                 f"cell_size must be the same in all scenes of a batch, got {scene.cell_size} in scene {index} and "
-                f"{first.cell_size} in scene 0; simulate them apart"
+                f"{first.cell_size} in scene 0; simulate them separately"
             )
         counts = whole_cells(scene.domain_size, scene.cell_size)
         for axis, length, cells in zip("xyz", scene.domain_size, counts, strict=True):

@@ -7,7 +7,7 @@ from datagen.mpm.layout import COUNT, HEAD, SETTING, STATE
 from datagen.mpm.sweep import ON_TRIANGLE
 
 CLEARANCE = 1e-3  # smallest distance of a particle from a triangle, in cells; rounding is 1e-5
-STOP = 1.5 * CLEARANCE  # distance at which a particle is placed, so that rounding brings it no nearer
+STOP = 1.5 * CLEARANCE  # distance at which a particle is placed, so that rounding does not move it within CLEARANCE
 EDGE = 1e-4  # crossings count up to this barycentric coordinate beyond an edge; closes gaps between triangles
 # Vectors of a node's contact: the free direction for particles that see the node, and for those from which a sheet
 # hides it (zero if all motion is free); the friction of each, and the distance of the first from its surface in cells;
@@ -39,7 +39,7 @@ def hidden_nodes(scaled, to_base, list_at: ti.i32, pose: ti.i32, arrays: ti.temp
 
     Bit 9 i + 3 j + k is 1 if the line to node base + (i, j, k) crosses a triangle of a sheet. The particle is at
     `scaled`, in cells; the vector to its base node is to_base; its list begins at list_at. If the sheet `moves`,
-    `scaled` is in the sheet's frame, and `pose` is the begin of its pose.
+    `scaled` is in the sheet's frame, and `pose` is the start of its pose.
     """
     bits = 0
     for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + arrays.contact[list_at + 1]):
@@ -130,8 +130,8 @@ def _first_crossing(start, end, list_at: ti.i32, arrays: ti.template()):
 def _first_moving(start, end, fraction_at_rest: ti.f32, scene: ti.i32, arrays: ti.template()):
     """Returns the first triangle of a moving obstacle that the path meets before the given fraction.
 
-    The path is that in the obstacle's frame, from its pose at the interval's begin to that at its end. Results: those
-    of _first_crossing; the velocity of the surface, in cells a second; and where it takes the start.
+    The path is that in the obstacle's frame, from its pose at the start of the interval to that at the end. Results:
+    those of _first_crossing; the velocity of the surface, in cells a second; and the start moved with the obstacle.
     """
     first = fraction_at_rest
     stop = end

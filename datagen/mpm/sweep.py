@@ -28,7 +28,7 @@ class Sweep:
     triangle_F43: np.ndarray
     obstacle_F: np.ndarray  # int32, index of the triangle's obstacle
     base_K3: np.ndarray  # int32
-    begin_K: np.ndarray  # int64, begin of each list in triangle_L; it ends at the next begin
+    begin_K: np.ndarray  # int64, start of each list in triangle_L; it ends at the next start
     sheets_K: np.ndarray  # int32, number of triangles of sheets in each list
     triangle_L: np.ndarray  # int32
 

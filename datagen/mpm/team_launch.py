@@ -70,7 +70,7 @@ class TeamLaunch(Launch):
         self.team, self.teams, self.room = team, min(teams, len(self.scenes)), teams * team.blocks
         if self.particles > MAXIMUM_PARTICLES:
             raise ConfigError(
-                f"a batch must hold at most {MAXIMUM_PARTICLES} particles, got {self.particles} of {len(self.scenes)} "
+                f"a batch must have at most {MAXIMUM_PARTICLES} particles, got {self.particles} of {len(self.scenes)} "
                 "scenes; lower scenes_per_launch"
             )
         fields = FIELD.solid if has_solid(self.variant) else FIELD.fluid

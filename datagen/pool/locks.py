@@ -2,7 +2,7 @@
 
 Locks are on bytes of the data set's file `.lock`. A process that changes the manifest locks byte 0. All generators
 share a lock on byte 1. Each episode has a byte of its own, locked by the generator that makes the episode. The kernel
-frees the locks of a process however it ends. So no claim becomes stale, and no clock is needed.
+releases the locks of a process at its end, also after a crash. So no claim becomes stale, and no clock is needed.
 """
 
 import contextlib
@@ -18,15 +18,15 @@ from hgn.system.locks import NO_LOCKS, lock_bytes, open_lock
 
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
-_REMEDY = "mount it with them (NFS with its lock service, Lustre with -o flock) or choose another out=..."
+_REMEDY = "mount it with locks (NFS with its lock service, Lustre with -o flock) or choose another out=..."
 _EPISODES_OF_A_SPLIT = 1 << 40  # bytes between the first episodes of two splits; a locked byte need not exist
 
 
 class ShardLocks:
-    """Holds one generator's locks on a folder. It is a context manager."""
+    """Manages one generator's locks on a folder. It is a context manager."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises: ConfigError if the file system has no locks, or grants them to everybody."""
+        """Raises: ConfigError if the file system has no locks, or grants a lock twice."""
         self._path = folder / LOCK_NAME
         self._file = open_lock(self._path)
         try:
@@ -42,8 +42,8 @@ class ShardLocks:
         try:
             if self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE, file=other):
                 raise ConfigError(
-                    f"{self._path} must lie on a file system whose locks exclude others, got one that grants them to "
-                    f"everybody; {_REMEDY}"
+                    f"{self._path} must be on a file system with exclusive locks, got one that grants a lock twice; "
+                    f"{_REMEDY}"
                 )
         finally:
             os.close(other)
@@ -86,7 +86,7 @@ class ShardLocks:
             if error.errno not in NO_LOCKS:
                 raise
             raise ConfigError(
-                f"{self._path} must lie on a file system with file locks, got {error.strerror}; {_REMEDY}"
+                f"{self._path} must be on a file system with file locks, got {error.strerror}; {_REMEDY}"
             ) from None
 
 

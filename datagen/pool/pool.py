@@ -112,7 +112,7 @@ class Pool:
             self._progress.found(of_others)
         if not self._writer.has_claims and not self._writer.complete and not self._said_waiting:
             self._said_waiting = True
-            self._progress.message("other generators make the rest; waiting for them")
+            self._progress.message("other generators make the remaining episodes; waiting for them")
 
     def _publish(self) -> bool:
         shard = self._writer.publish_next(wait=False)  # other episodes are staged while the shard is packed
@@ -197,7 +197,7 @@ class Pool:
             if slept:  # this process was stopped too (Ctrl-Z, a frozen container)
                 worker.heard_at = now
             elif worker.speaks and worker.tasks and now - worker.heard_at > silence:
-                self._replace(worker, f"it said nothing for {silence:.0f} s")
+                self._replace(worker, f"it sent nothing for {silence:.0f} s")
 
     def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
         if kind == "idle":

@@ -12,7 +12,7 @@ from hgn.system.progress import advance_to, bar
 
 
 class Progress:
-    """Reports nothing. It is the base of the other classes."""
+    """Reports nothing. The other classes inherit from it."""
 
     def start(self, done: int, total: int, frames: int) -> None:
         """Starts the report: `total` episodes of `frames` frames, of which `done` are finished."""

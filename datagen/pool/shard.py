@@ -70,7 +70,7 @@ def require_sealed(path: Path) -> None:
         for start in range(0, size, _COPY_BYTES):
             digest.update(file.read(min(_COPY_BYTES, size - start)))
         if file.read() != _seal(digest):
-            raise ConfigError(f"{path} must end with the sha256 of what it holds, got another; delete it and run again")
+            raise ConfigError(f"{path} must end with the sha256 of its content, got another; delete it and run again")
 
 
 def _seal(digest: Any) -> bytes:
@@ -101,7 +101,7 @@ def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> Shard
     expected = [episode_key(shard.split, index) for index in shard.indices]
     if list(located) != expected:
         raise ConfigError(
-            f"{path} must hold {', '.join(expected)}, got {', '.join(located) or 'nothing'}; delete it and run the "
+            f"{path} must contain {', '.join(expected)}, got {', '.join(located) or 'nothing'}; delete it and run the "
             "generator again"
         )
     content = FileBytes(path)

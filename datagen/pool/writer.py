@@ -258,7 +258,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes, or None. There is none where locks work."""
+        """Returns another generator's shard with these episodes, or None. It exists only if locks fail."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -287,7 +287,7 @@ class DatasetWriter:
     def _is_present(self, shard: ShardEntry) -> bool:
         path = self.folder / shard.name
         if not path.exists():
-            self._report(f"{path} is listed in the index but missing; its episodes are made again")
+            self._report(f"{path} is listed in the index but missing; its episodes are generated again")
             return False
         size = path.stat().st_size
         if size != shard.bytes:
@@ -328,7 +328,7 @@ class DatasetWriter:
                 require_sealed(path)
                 inspect_shard(path, ShardRange(shard.split, index, index + 1), self.config)
             except ConfigError as error:
-                self._report(f"{error}; the episode is made again")
+                self._report(f"{error}; the episode is generated again")
                 path.unlink()
             else:
                 self.add_staged(shard.split, index)
@@ -372,7 +372,7 @@ class DatasetWriter:
         """Reads the shards that other generators have published."""
         try:
             content = read_replaced(self.folder / MANIFEST_NAME)
-        except FileNotFoundError:  # removed by hand; the next shard writes it again
+        except FileNotFoundError:  # removed by hand; the next publication writes it again
             return
         if content != self._content:
             manifest = Manifest.parse(content, self.folder)

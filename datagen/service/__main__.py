@@ -31,8 +31,8 @@ class ServiceConfig(Bounded):
 
     host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
-    health_port: Port | None = None  # also answers /healthz at this port, for the probes of a busy service; null: no
-    connections: Positive[int] = 1024  # connections; one more closes the oldest without a request, else it gets a 503
+    health_port: Port | None = None  # second port for /healthz, which answers even if the service is busy; null: no
+    connections: Positive[int] = 1024  # limit of connections; a further one closes the oldest idle one, or gets a 503
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
@@ -60,7 +60,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         page = None
         if service.health_port is not None:
             page = stack.enter_context(HealthPage(_listen(service.host, service.health_port, token)))
-        # this import takes a second, and the pool's processes, which import this file, do not need it
+        # imported here, because it takes a second, and the pool's processes import this file without using it
         from datagen.service.server import make_app, make_server, telling
 
         with Supervisor(config, progress, backend) as supervisor:
@@ -104,11 +104,11 @@ def _listen(host: str, port: int, token: str | None) -> socket.socket:
     except (OSError, UnicodeError) as error:  # UnicodeError: text that cannot be a host name
         number, cause = (error.errno, error.strerror) if isinstance(error, OSError) else (None, error)
         remedies = {
-            errno.EADDRINUSE: "stop what uses it or choose another port=... (0: any free one)",
+            errno.EADDRINUSE: "stop the program there or choose another port=... (0: any free one)",
             errno.EACCES: "choose a port of 1024 or more",
         }
         remedy = remedies.get(number or 0, "choose host=127.0.0.1, or an address of this machine")
-        raise ConfigError(f"host and port must be free to serve on, got {host}:{port} ({cause}); {remedy}") from None
+        raise ConfigError(f"host and port must be available, got {host}:{port} ({cause}); {remedy}") from None
 
 
 if __name__ == "__main__":

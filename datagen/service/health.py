@@ -1,7 +1,7 @@
-"""Serves /healthz at a separate port from a separate process. A thread of the service would wait for Python's lock.
+"""Serves /healthz in a separate process at a separate port. A thread of the service would wait for Python's lock.
 
-The service reports its state every second. After SILENCE_S without a report the answer is 503, which shows a service
-that hangs.
+The service reports its state every second. After SILENCE_S without a report the answer is 503, because the
+service hangs.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from typing import Any
 SILENCE_S = 30.0
 _PATIENCE_S = 2.0  # longest silence within a request
 MOST_OPEN = 64  # connections; further ones close the oldest, because whole requests are answered without delay
-_PIPE_BYTES = 4096  # size of the pipe for reports; it contains those of a minute
+_PIPE_BYTES = 4096  # size of the pipe, enough for the reports of a minute
 
 
 class HealthPage:
@@ -72,7 +72,7 @@ class Page(ThreadingHTTPServer):
         super().__init__(listener.getsockname()[:2], _Handler, bind_and_activate=False)
         self.socket.close()
         self.socket = listener
-        self.report = time.monotonic(), 503, {"status": "the service has not begun"}
+        self.report = time.monotonic(), 503, {"status": "the service has not started"}
         self._open: deque[Any] = deque()
 
     def read(self, line: str) -> None:
@@ -81,7 +81,7 @@ class Page(ThreadingHTTPServer):
         self.report = time.monotonic(), status, content
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answers in a thread. A connection that drips would stay open for hours."""
+        """Answers in a thread. A slow connection would stay open for hours."""
         self._open.append(request)
         if len(self._open) > MOST_OPEN:
             with contextlib.suppress(OSError):  # it is closed already

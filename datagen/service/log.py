@@ -73,7 +73,7 @@ class _Stream:
             try:
                 self._pieces.put_nowait(piece)
             except queue.Full:
-                self._left_out, self.error = True, "its reader does not take it"
+                self._left_out, self.error = True, "its reader does not read it"
         self._pieces.put(b"")
         os.close(self._source)
 

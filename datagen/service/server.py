@@ -43,7 +43,7 @@ from hgn.system.files import read_replaced
 
 _OPEN_PATHS = ("/healthz",)
 _GRACE_S = 5  # time for running answers after a stop; readers later resume interrupted downloads
-_FRESH_S = 0.05  # age up to which a read manifest is used; a thousand readers may ask in a second
+_FRESH_S = 0.05  # largest age of a manifest that is used again; a thousand readers may send requests in a second
 _BACKLOG = 256  # connections that the system accepts before the service handles them
 _OTHER_FILES = 64  # open files besides connections and shards
 OPEN_FILES = 1024  # assumed limit of open files
@@ -62,8 +62,8 @@ class Snapshot:
 class Published:
     """The manifest of a folder, and the places of its shards.
 
-    For any number of requests, a changed manifest is read once, and each line of the index is read once when needed. A
-    snapshot never changes, so a request sees one manifest.
+    A changed manifest and each needed line of the index are read once, however many requests arrive. A snapshot never
+    changes, so a request sees one manifest.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -102,7 +102,7 @@ class Published:
         try:
             status = path.stat()
         except FileNotFoundError:
-            raise ConfigError("the data set has no manifest yet; ask again in a moment") from None
+            raise ConfigError("the data set has no manifest yet; try again later") from None
         stamp = (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
         if self._snapshot is None or stamp != self._stamp:
             content = read_replaced(path)
@@ -140,12 +140,10 @@ class Guard:
             name == b"transfer-encoding" or (name == b"content-length" and value != b"0")
             for name, value in scope["headers"]
         ):
-            await PlainTextResponse("nothing can be sent here\n", 413, {"connection": "close"})(scope, receive, counted)
+            await PlainTextResponse("uploads are not accepted\n", 413, {"connection": "close"})(scope, receive, counted)
             return
         if self._expected is None and not _is_own_name(scope):  # a web page may let its host name point here
-            await PlainTextResponse("ask by the address of this machine, or set a token\n", 421)(
-                scope, receive, counted
-            )
+            await PlainTextResponse("use this machine's address, or set a token\n", 421)(scope, receive, counted)
             return
         if not self._allowed(scope):
             refusal = PlainTextResponse(
@@ -331,18 +329,18 @@ def _metrics(manifest: Manifest, pool: PoolState, counters: Counter[str]) -> str
     splits = [(split, f'{{split="{split}"}}') for split in manifest.requested]
     codes = sorted(key.removeprefix("code ") for key in counters if key.startswith("code "))
     families: list[tuple[str, str, str, list[tuple[str, float]]]] = [
-        ("hgn_episodes_requested", "gauge", "Episodes the data set is to have.",
+        ("hgn_episodes_requested", "gauge", "Requested number of episodes.",
          [(label, manifest.requested[split]) for split, label in splits]),
         ("hgn_episodes_published", "gauge", "Episodes that can be read.",
          [(label, manifest.published(split)) for split, label in splits]),
         ("hgn_shards_published", "gauge", "Shards that can be read.", [("", len(manifest.shards))]),
-        ("hgn_shard_bytes_published", "gauge", "Bytes of these.",
+        ("hgn_shard_bytes_published", "gauge", "Bytes of these shards.",
          [("", sum(totals.bytes for totals in manifest.totals.values()))]),
         ("hgn_manifest_revision", "counter", "Revision of the manifest.", [("", manifest.revision)]),
         ("hgn_scenes_quarantined", "gauge", "Scenes that could not be simulated.",
          [("", manifest.shards.state.quarantined)]),
         ("hgn_generator_running", "gauge", "1 while the pool runs.", [("", int(pool.status == "running"))]),
-        ("hgn_generator_failed", "gauge", "1 when it ended for good with an error.",
+        ("hgn_generator_failed", "gauge", "1 when it ended permanently with an error.",
          [("", int(pool.status == "failed"))]),
         ("hgn_generator_starts_total", "counter", "Starts of the pool.", [("", pool.starts)]),
         ("hgn_generator_episodes_done", "gauge", "Episodes published or staged.", [("", pool.done)]),

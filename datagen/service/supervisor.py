@@ -124,7 +124,7 @@ class Supervisor:
         finally:
             connection.close()
         if outcome == "died":
-            text = f"it said nothing for {silence:.0f} s" if silent_s > silence else cause_of_exit(process)
+            text = f"it sent nothing for {silence:.0f} s" if silent_s > silence else cause_of_exit(process)
         return outcome, text
 
     def _note(self, kind: str, *values: Any) -> None:

@@ -37,7 +37,7 @@ def test_the_last_report_is_answered(page):
     """Another process answers, beside 100 connections that send nothing, too."""
     told, port = page
     assert told.process.pid != os.getpid()
-    assert ask(port) == (503, {"status": "the service has not begun"})
+    assert ask(port) == (503, {"status": "the service has not started"})
     told.tell(200, {"status": "ok"})
     wait_until(lambda: ask(port) == (200, {"status": "ok"}))
     told.tell(503, {"status": 2000 * "\U0001f30a"})

@@ -18,7 +18,7 @@ def test_who_writes_waits_for_nobody():
         writer = threading.Thread(target=lambda: [os.write(sink, 4096 * b"x") for _ in range(1000)])
         writer.start()
         wait_until(lambda: not writer.is_alive())
-        wait_until(lambda: log.error == "its reader does not take it")
+        wait_until(lambda: log.error == "its reader does not read it")
         taken = b""
         while b"lines are missing here" not in taken:
             taken += os.read(source, 2**16)

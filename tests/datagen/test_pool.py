@@ -377,5 +377,5 @@ def test_stopped_solver_is_replaced(make_config, monkeypatch):
     config, recorder = make_config(training_scenes=1, validation_scenes=0, test_scenes=0), Recorder()
     with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
         Pool(writer, recorder, Workers()).run()
-    assert recorder.messages[0].startswith("a worker died (it said nothing for 600 s); it is replaced")
+    assert recorder.messages[0].startswith("a worker died (it sent nothing for 600 s); it is replaced")
     assert solvers[0].killed and solvers[0].heard_at > 1000 and list(passes) == [250]

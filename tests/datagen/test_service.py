@@ -209,7 +209,7 @@ def test_damage_is_not_served(ask, folder):
         status, _, body = ask(path)
         assert status == 503 and b"schema_version must be 1, got 99" in body
     (folder / "manifest.json").unlink()
-    assert ask("/manifest.json")[::2] == (503, b"the data set has no manifest yet; ask again in a moment\n")
+    assert ask("/manifest.json")[::2] == (503, b"the data set has no manifest yet; try again later\n")
     (folder / "manifest.json").mkdir()
     assert ask("/healthz")[0] == ask("/progress")[0] == 503
 
@@ -262,7 +262,7 @@ def test_pool_that_says_nothing_is_started_again(make_config, monkeypatch):
     recorder = Recorder()
     with Supervisor(make_config(worker_silence_s=0.05), recorder) as supervisor:
         wait_until(lambda: supervisor.state.status == "complete")
-    assert len(started) == 2 and "the pool ended (it said nothing for 0 s); it is started" in recorder.messages[0]
+    assert len(started) == 2 and "the pool ended (it sent nothing for 0 s); it is started" in recorder.messages[0]
 
 
 def test_full_disk_is_waited_for(make_config, backend, tmp_path):
@@ -313,7 +313,7 @@ def test_what_cannot_be_served(monkeypatch, capsys, tmp_path, folder):
         taken = listener.getsockname()[1]
         assert run_service([f"port={taken}"], monkeypatch) == 2
     errors = capsys.readouterr().err
-    assert errors.startswith(f"error: host and port must be free to serve on, got 127.0.0.1:{taken} (Address already")
+    assert errors.startswith(f"error: host and port must be available, got 127.0.0.1:{taken} (Address already")
     mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
     (folder / "manifest.json").write_text(json.dumps(mapping))
     assert run_service([f"out={folder}", "port=0"], monkeypatch) == 2

@@ -218,7 +218,7 @@ def test_broken_staged_file_is_made_again(make_config, make_dataset, small_datas
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
         assert ("train", 1) in claim_all(writer)
-    assert "must end with the sha256 of what it holds" in messages[0] and "is made again" in messages[0]
+    assert "must end with the sha256 of its content" in messages[0] and "is generated again" in messages[0]
     assert hashes(make_dataset(make_config())) == hashes(small_dataset)
 
 
@@ -264,7 +264,7 @@ def test_what_is_published_is_on_the_disk(make_config, stage, monkeypatch):
 def test_locks_that_exclude_nobody(make_config, monkeypatch):
     """A file system that grants every lock to everybody is refused: generators would sweep each other's files."""
     monkeypatch.setattr("datagen.pool.locks.fcntl.fcntl", lambda *arguments: 0)
-    with pytest.raises(ConfigError, match=r"must lie on a file system whose locks exclude others.*-o flock"):
+    with pytest.raises(ConfigError, match=r"must be on a file system with exclusive locks.*-o flock"):
         DatasetWriter(make_config()).__enter__()
 
 

@@ -29,7 +29,7 @@ def test_copy_is_the_data_set(make_config, make_dataset, capsys):
     """The copy reads like the folder; what comes later is added to it, and what is there is not sent again."""
     folder = make_dataset(make_config(training_scenes=2))
     assert main({"data": str(folder), "to": "memory://bucket/set"}) == 0
-    assert capsys.readouterr().out == "memory://bucket/set holds 5 shards, the whole data set\n"
+    assert capsys.readouterr().out == "memory://bucket/set has 5 shards, the whole data set\n"
     assert Manifest.load("memory://bucket/set") == Manifest.load(folder)
     assert keys("memory://bucket/set") == keys(folder) and len(keys(folder)) == 2
     files = fsspec.filesystem("memory")
@@ -76,10 +76,10 @@ def test_what_is_refused(folder, make_config, make_dataset, tmp_path):
     """Another data set at the URL, one made anew, and an altered or missing shard."""
     main({"data": str(folder), "to": "memory://there"})
     other = make_dataset(make_config(folder=str(tmp_path / "other"), seed=7))
-    with pytest.raises(ConfigError, match="to must be empty or hold the same data set, got another one in memory://"):
+    with pytest.raises(ConfigError, match="to must be empty or contain the same data set, got another one in m"):
         main({"data": str(other), "to": "memory://there"})
     anew = make_dataset(make_config(folder=str(tmp_path / "anew"), training_scenes=1))
-    with pytest.raises(ConfigError, match="to must hold shards that the data set here begins with, got others"):
+    with pytest.raises(ConfigError, match="to must contain the first shards of the local data set, got others"):
         main({"data": str(anew), "to": "memory://there"})
     shard = folder / "train-000001-000002.tar"
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")

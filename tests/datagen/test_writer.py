@@ -79,7 +79,7 @@ def test_lost_manifest(make_config, folder):
     (folder / "manifest.json").unlink()
     shard = folder / "train-000002-000004.tar"
     os.truncate(shard, locate_members(shard)["train-000003"]["position.npy"][0] - 512)
-    with pytest.raises(ConfigError, match="must hold train-000002, train-000003, got train-000002; delete it"):
+    with pytest.raises(ConfigError, match="must contain train-000002, train-000003, got train-000002; delete it"):
         DatasetWriter(make_config()).__enter__()
 
 

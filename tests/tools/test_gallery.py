@@ -303,7 +303,7 @@ def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
     assert drawn == ["tiny.png", "tiny.gif", "tiny_error.png"]
     assert render.main(options | {"others": [], "out": str(tmp_path / "solver.png")}) == 0
     monkeypatch.setattr("datagen.mpm.solver.simulate", lambda *_, **__: [SceneFailure("burst")])
-    with pytest.raises(ConfigError, match=r"tiny.yaml must be a scene that the solver keeps together, got burst"):
+    with pytest.raises(ConfigError, match=r"tiny.yaml must be a scene that the solver can simulate, got burst"):
         render.main(options)
 
 

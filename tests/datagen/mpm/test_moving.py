@@ -148,7 +148,7 @@ def test_bad_motion_is_refused():
         simulate([scene], CONFIG, 2, RATE_HZ)
     slow = moving(still, [0.0, 0.1], [(0, 0, 0), (0, 0.01, 0)])
     scene = dataclasses.replace(scene, obstacles=(slow,))
-    with pytest.raises(ConfigError, match="fixed_time_step_s must be null where obstacles move"):
+    with pytest.raises(ConfigError, match="fixed_time_step_s must be null if obstacles move"):
         simulate([scene], MpmConfig(device="cpu", fixed_time_step_s=1e-3), 2, RATE_HZ)
 
 

@@ -144,7 +144,7 @@ def test_blocks_that_are_not_at_work_at_once(monkeypatch):
     monkeypatch.setattr(team_launch, "PATIENCE", (10_000, 10_000))
     scenes = [mixed(120, 0, (0, -3, 0)), HEAVY]
     expected, _ = simulated(scenes, frames=4)
-    with pytest.warns(RuntimeWarning, match="does not run 3 blocks of 1 threads at once"):
+    with pytest.warns(RuntimeWarning, match="does not run the 3 blocks of 1 threads of a scene concurrently"):
         found, _ = simulated(scenes, frames=4, team=Team(1, 3, 1))
     assert np.array_equal(found.position_TN3, expected.position_TN3)
 
