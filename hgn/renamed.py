@@ -5,10 +5,9 @@
 | a key | KEYS | loads |
 | a setting was removed | REMOVED | loads with the fixed value, else refused; refused on a command line too |
 | a setting of the solver became a part of its method | METHODS | loads as the method |
-| a setting of the solver was added | BEFORE | gets what the solver did before |
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,32 +20,11 @@ ANY = object()
 class Removed:
     """The value that a removed setting always has now, and the remedy for its use.
 
-    With ANY a setting has no fixed value, and stored files load with any value. Files also load if other settings of
-    the section make the setting ineffective.
+    With ANY a setting has no fixed value, and stored files load with any value.
     """
 
     value: Any = ANY
     remedy: str = "leave it out"
-    has_effect: Callable[[Mapping[str, Any]], bool] = lambda section: True
-
-    def allows(self, value: Any, section: Mapping[str, Any]) -> bool:
-        """Returns whether a stored section with this value gives the same results now."""
-        return self.value is ANY or value == self.value or not self.has_effect(section)
-
-
-def _relative(network: Mapping[str, Any]) -> bool:
-    return network.get("inputs", "absolute") != "absolute"
-
-
-def _rests(network: Mapping[str, Any]) -> bool:
-    return bool(network.get("rest_threshold"))
-
-
-def _rests_otherwise(network: Mapping[str, Any]) -> bool:
-    """Returns whether the materials that rest on larger cells are other than all except water."""
-    materials = set(network.get("materials", ()))
-    large = network.get("rest_large_materials")
-    return _rests(network) and (materials if large is None else set(large)) != materials - {"water"}
 
 
 LAST_COMMIT = "commit a0b88cb, before release 0.2.0, is the last with it"
@@ -59,15 +37,15 @@ REMOVED: dict[str, Removed] = {
     "scene.clearance_cells": Removed(2.0),
     "scene.maximum_tilted_gravity": Removed(19.6),
     **{f"mpm.{key}": Removed(value) for key, value in CONSTANTS.items()},
-    "network.contact_forces": Removed("normal", TRAIN_ANEW, _relative),
-    "network.contact_gate": Removed("cell", TRAIN_ANEW, _relative),
-    "network.contact_reach_cells": Removed(3.0, TRAIN_ANEW, _relative),
+    "network.contact_forces": Removed("normal", TRAIN_ANEW),
+    "network.contact_gate": Removed("cell", TRAIN_ANEW),
+    "network.contact_reach_cells": Removed(3.0, TRAIN_ANEW),
     "network.material_embedding": Removed(16, TRAIN_ANEW),
     "network.maximum_neighbours": Removed(None, f"leave it out; {LAST_COMMIT}"),
-    "network.rest_large_materials": Removed("all but water", "leave it out", _rests_otherwise),
-    "network.rest_levels": Removed(2, "leave it out", _rests),
+    "network.rest_large_materials": Removed(["sand", "snow"], "leave it out: all materials but water"),
+    "network.rest_levels": Removed(2),
     "network.static_spacing_cells": Removed(remedy=f"leave it out; {LAST_COMMIT}"),
-    "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW, lambda network: not _relative(network)),
+    "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW),
 }
 
 # Settings of `network` in 0.1.0 that are in `step` now.
@@ -75,40 +53,21 @@ STEP = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STEP}
 
 # Old key to new key. A key stays in its section.
-KEYS = {
-    "scene.initial_speed_share": "scene.moving_group_fraction",
-    "cursor": "sampler_state",  # in checkpoints
-}
-
-# Settings that data sets and weights of 0.1.0 do not have, and the values that they had in effect.
-BEFORE: dict[str, Any] = {
-    "network.contact_forces": "any",
-    "network.contact_gate": "particle",
-    "network.contact_reach_cells": 1.5,
-    "network.rest_large_materials": None,
-    "network.rest_levels": 1,
-    "mpm.time_integration": "symplectic_euler",
-    "mpm.water_density_relaxation_s": None,
-    "mpm.sand_grain_diameter_m": 0.0,
-}
+KEYS = {"scene.initial_speed_share": "scene.moving_group_fraction"}
 
 
 def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
     """Returns a stored mapping with the present keys.
 
-    `section` is its dotted name in the configuration. Settings that are newer than the file are added, and removed
-    settings are dropped. A removed setting with another value than the fixed one stays, and `from_mapping` refuses it.
+    `section` is its dotted name in the configuration. Removed settings are dropped. With another value
+    than the fixed one they stay, and `from_mapping` refuses them.
     """
-    # only networks of 0.1.0 have the key material_embedding
-    if section == "mpm" or (section == "network" and "material_embedding" in mapping):
-        before = {_last(key): value for key, value in BEFORE.items() if key.startswith(f"{section}.")}
-        mapping = before | dict(mapping)
     result = {}
     for old, value in mapping.items():
         key = _join(section, str(old))  # keys of a checkpoint may be numbers
         key = KEYS.get(key, key)
         removed = REMOVED.get(key)
-        if removed is None or not removed.allows(value, mapping):
+        if removed is None or removed.value not in (ANY, value):
             result[_last(key)] = current_names(value, key) if isinstance(value, Mapping) else value
     return _current_solver(result) if section == "mpm" else result
 

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_075,
+    "hgn": 33_996,
     "datagen": 8_937,
     "tools": 6_352,
-    "tests": 34_789,
+    "tests": 34_750,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -10,6 +10,7 @@ from hgn.network.build import build_network
 from hgn.renamed import KEYS, REMOVED, Removed, current_names, stored_names
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, section_of, to_mapping
+from hgn.training.checkpoint import SECTION, Progress
 
 SECTIONS = (SceneConfig, MpmConfig, NetworkConfig)
 
@@ -81,8 +82,7 @@ def test_files_of_before(tmp_path, monkeypatch, removed):
 
 
 def test_networks_of_before():
-    """They load where removed settings say what is always so now, or where these have no effect; others are refused by
-    the setting's name."""
+    """They load where removed settings say what is always so now; others are refused by the setting's name."""
     contacts = {"contact_gate": "cell", "contact_forces": "normal", "contact_reach_cells": 3.0}
     older = {"material_embedding": 16, "wall_distance_cells": 8.0}  # keys of 0.1.0
     rests = {"rest_levels": 2, "rest_large_materials": ["sand", "snow"]}
@@ -91,18 +91,13 @@ def test_networks_of_before():
     for config, told, refused in (
         (NetworkConfig(), {}, None),
         (NetworkConfig(), older, None),
-        (NetworkConfig(), older | {"contact_gate": "particle", "contact_reach_cells": 1.5, "rest_levels": 1}, None),
         (NetworkConfig(), older | {"wall_distance_cells": 6.0}, "wall_distance_cells"),
         (NetworkConfig(), older | {"material_embedding": 8}, "material_embedding"),
-        (relative, {}, None),
-        (relative, older | contacts | {"rest_levels": 3}, None),
         (relative, older | contacts | {"contact_forces": "any"}, "contact_forces"),
         (relative, older | contacts | {"contact_reach_cells": 2.0}, "contact_reach_cells"),
-        (relative, older | {"contact_forces": "normal", "contact_reach_cells": 3.0}, "contact_gate"),  # younger
         (relative, older | contacts | rests | resting, None),
         (relative, older | contacts | rests | resting | {"rest_levels": 1}, "rest_levels"),
         (relative, older | contacts | rests | resting | {"rest_large_materials": None}, "rest_large_materials"),
-        (relative, older | contacts | resting | {"rest_large_materials": ["sand", "snow"]}, "rest_levels"),
         (gns, {"maximum_neighbours": None, "static_spacing_cells": 0.25}, None),
         (gns, {"maximum_neighbours": 64}, "maximum_neighbours"),
     ):
@@ -137,3 +132,9 @@ def test_the_table_is_sound():
     fields = {f"{section_of(cls)}.{name}" for cls in SECTIONS for name in to_mapping(cls())}
     assert not fields & (REMOVED.keys() | KEYS.keys())
     assert all(key in fields for key in KEYS.values() if key.startswith(("scene.", "mpm.", "network.")))
+
+
+def test_checkpoints_of_the_first_release():
+    """They are refused with the release that exports them."""
+    with pytest.raises(ConfigError, match=r"sampler_state must be given, .* release 0\.1\.0 with 0\.2\.0"):
+        Progress.of({SECTION: {"updates": 3, "cursor": {"epoch": 1}}})

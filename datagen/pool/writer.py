@@ -32,7 +32,6 @@ from datagen.pool.plan import (
 from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, require_sealed, staged_path, sync_staged
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
-from hgn.data.index import ListedIndex
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
 from hgn.schema import ConfigError
 from hgn.system.files import (
@@ -387,17 +386,18 @@ class DatasetWriter:
 
     def _publish_list(self, shards: Sequence[ShardEntry] = (), quarantined: Sequence[QuarantinedScene] = ()) -> None:
         revision = self.manifest.revision + len(shards)
-        self.manifest = self.manifest.extended(
-            self.folder, shards, quarantined, revision=revision, requested=self.requested
+        self._take(
+            self.manifest.extended(self.folder, shards, quarantined, revision=revision, requested=self.requested)
         )
-        self._note_published()
-        self._content = (self.folder / MANIFEST_NAME).read_bytes()
 
     def _rewrite_list(self, shards: Sequence[ShardEntry]) -> None:
-        index = ListedIndex(shards, self.manifest.quarantined)
-        self.manifest = dataclasses.replace(self.manifest, shards=index, revision=self.manifest.revision + 1)
+        manifest = dataclasses.replace(self.manifest, revision=self.manifest.revision + 1, requested=self.requested)
         self._forget_published()
-        self._publish_list()
+        self._take(manifest.save(self.folder, shards, manifest.quarantined))
+
+    def _take(self, manifest: Manifest) -> None:
+        self.manifest, self._content = manifest, (self.folder / MANIFEST_NAME).read_bytes()
+        self._note_published()
 
     def _forget(self, shard: ShardRange) -> None:
         for index in shard.indices:

@@ -14,7 +14,7 @@ from aiohttp.connector import Connection
 
 from hgn.data.verification import StorageError
 
-LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
+LARGEST_BYTES = 2**29  # limit for whole files, as shards of servers without ranges
 # smallest mean speed of a body, bytes/s, apart from a grace of SLOW_S seconds; later grace is up to SILENCE_S
 LEAST_BYTES_S, SLOW_S = 4096, 20.0
 SILENCE_S = 60.0  # limit between two pieces, seconds: aiohttp reports no error of a malformed body

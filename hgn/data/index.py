@@ -41,7 +41,6 @@ from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
 INDEX_NAME = "index"
 SEGMENT_SHARDS = 128  # number of shards in a segment
-_IN_MEMORY = 0  # generation of an index without files
 _SEGMENTS_CACHED = 64  # number of segments in memory: 8,192 shards
 
 T = TypeVar("T")
@@ -117,7 +116,7 @@ class Index(Sequence[ShardEntry]):
 
     def continued(self, later: "Index") -> "Index":
         """Returns `later`. If it is a later state of the same index, it shares the cache of this one."""
-        if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
+        if later.state.generation == self.state.generation and len(later) >= len(self):
             later._read = self._read
         return later
 
@@ -288,32 +287,6 @@ class Index(Sequence[ShardEntry]):
             if len(read.segments) > _SEGMENTS_CACHED:
                 read.segments.popitem(last=False)
             return segment.shards
-
-
-class ListedIndex(Index):
-    """Holds an index in memory, for example that of a manifest of the first release."""
-
-    def __init__(self, shards: Sequence[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()) -> None:
-        state = IndexState(_IN_MEMORY, len(shards), quarantined=len(quarantined))
-        super().__init__("", state, totals_of(shards))
-        self._shards, self._quarantined = list(shards), list(quarantined)
-        self._read.see(0, self._shards)
-
-    def quarantined(self) -> list[QuarantinedScene]:
-        return self._quarantined
-
-    def size(self, name: str) -> int | None:
-        return None
-
-    def _ends(self) -> list[_SegmentEnd]:
-        ends = self._read.ends
-        for stop in range((len(ends) + 1) * SEGMENT_SHARDS, len(self) + 1, SEGMENT_SHARDS):
-            before = ends[-1].totals if ends else {split: SplitTotals() for split in SPLITS}
-            ends.append(_SegmentEnd(0, totals_of(self._shards[stop - SEGMENT_SHARDS : stop], before)))
-        return ends
-
-    def _segment(self, number: int) -> list[ShardEntry]:
-        return self._shards[number * SEGMENT_SHARDS :][:SEGMENT_SHARDS]
 
 
 def extend(

@@ -1,15 +1,14 @@
 """Reads and writes the manifest of a data set: published shards, their content, and the settings of their generation.
 
 `manifest.json` is written last and atomically, so all listed shards are complete. The append-only files of
-`hgn.data.index` list the shards, so the manifest's size does not depend on their number. Manifests of the first release
-list the shards themselves.
+`hgn.data.index` list the shards, so the manifest's size does not depend on their number.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from hgn.data.entries import (
     require_sound,
 )
 from hgn.data.identity import identity_hash
-from hgn.data.index import Index, IndexState, ListedIndex, begin, extend, parse_json
+from hgn.data.index import Index, IndexState, begin, extend, parse_json
 from hgn.data.statistics import Statistics
 from hgn.data.storage import Storage, ask, open_storage
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version
@@ -34,12 +33,12 @@ from hgn.system.files import write_atomically
 
 __all__ = ["MANIFEST_NAME", "SPLITS", "EpisodeEntry", "Manifest", "QuarantinedScene", "ShardEntry"]
 MANIFEST_NAME = "manifest.json"
-MOST_BYTES = 32 << 20  # enough for 8,000 shards in a manifest of the first release
+MOST_BYTES = 32 << 20  # a manifest has a few KB, and more if it names thousands of mesh files
 
 
 @dataclass(frozen=True)
 class _Identity:
-    """Holds the fields that manifests of every release have."""
+    """Holds the fields of a manifest without those of its index."""
 
     config_hash: str  # hash of `config`
     config: dict[str, Any]  # `hgn.data.identity.dataset_identity`
@@ -57,18 +56,11 @@ class _Head(_Identity):
 
 
 @dataclass(frozen=True)
-class _Listing(_Identity):
-    """Holds the content of a `manifest.json` of the first release."""
-
-    shards: tuple[ShardEntry, ...] = ()
-    quarantined: tuple[QuarantinedScene, ...] = ()
-
-
-@dataclass(frozen=True)
 class Manifest(_Identity):
     """Describes the published part of a data set."""
 
-    shards: Index = field(default_factory=lambda: ListedIndex(()))  # in publication order
+    # in publication order; generation 0 has no files
+    shards: Index = field(default_factory=lambda: Index("", IndexState(generation=0), no_totals()))
 
     @staticmethod
     def load(folder: Path | str, patience_s: float | None = None) -> Manifest:
@@ -100,13 +92,10 @@ class Manifest(_Identity):
         require(len(content) <= MOST_BYTES, path, f"at most {MOST_BYTES} bytes", len(content))
         mapping = parse_json(content, path)
         require_schema_version(mapping, path)
-        if "index" not in mapping:
-            listing = from_mapping(_Listing, mapping, path)
-            shards: Index = ListedIndex(listing.shards, listing.quarantined)
-            head: _Identity = listing
-        else:
-            head = from_mapping(_Head, mapping, path)
-            shards = Index(folder, head.index, no_totals() | head.totals)
+        remedy = "release 0.1.0 listed the shards here: generate the data again, or read them with release 0.2.0"
+        require("index" in mapping, f"{path}.index", "given", None, remedy)
+        head = from_mapping(_Head, mapping, path)
+        shards = Index(folder, head.index, no_totals() | head.totals)
         for name, splits in (("requested", head.requested), ("totals", shards.totals)):
             require(set(splits) <= set(SPLITS), f"{path}.{name}", f"of {', '.join(SPLITS)}", sorted(splits))
         for totals in shards.totals.values():
@@ -120,20 +109,20 @@ class Manifest(_Identity):
         require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, as config has it", head.config_hash)
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 
-    def save(self, folder: Path | str) -> Manifest:
+    def save(
+        self, folder: Path | str, shards: Iterable[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()
+    ) -> Manifest:
         """Replaces the folder's manifest and, by a new generation, its index. Returns the manifest in the folder."""
         try:
             current = json.loads((Path(folder) / MANIFEST_NAME).read_bytes())["index"]["generation"]
-        except (FileNotFoundError, ValueError, LookupError, TypeError):  # no manifest, or one of the first release
+        except (FileNotFoundError, ValueError, LookupError, TypeError):  # no manifest, or a damaged one
             current = 0
-        return replace(self, shards=begin(Path(folder), current)).extended(
-            Path(folder), self.shards, self.quarantined, revision=self.revision
-        )
+        return replace(self, shards=begin(Path(folder), current)).extended(Path(folder), shards, quarantined)
 
     def extended(
         self,
         folder: Path,
-        shards: Sequence[ShardEntry] = (),
+        shards: Iterable[ShardEntry] = (),
         quarantined: Sequence[QuarantinedScene] = (),
         **changes: Any,
     ) -> Manifest:
@@ -141,9 +130,8 @@ class Manifest(_Identity):
 
         Raises: OSError; ConfigError if another program changed the index.
         """
-        if isinstance(self.shards, ListedIndex):
-            whole = ListedIndex([*self.shards, *shards], [*self.quarantined, *quarantined])
-            return replace(self, shards=whole, **changes).save(folder)
+        if self.shards.state.generation == 0:
+            return replace(self, **changes).save(folder, shards, quarantined)
         manifest = replace(self, shards=extend(folder, self.shards, shards, quarantined), **changes)
         mapping = {name: value for name, value in vars(manifest).items() if name != "shards"}
         head = _Head(**mapping, index=manifest.shards.state, totals=manifest.shards.totals)

@@ -22,9 +22,9 @@ class SamplerState(Bounded):
     epoch: NonNegative[int] = 0
     position: NonNegative[int] = 0  # number of samples of this epoch that were taken
     episodes: NonNegative[int] = 0  # number of episodes in this epoch; 0: not yet fixed
-    digest: str = ""  # digest of the shards with these episodes; empty: unknown (checkpoints of 0.1.0)
+    digest: str = ""  # digest of the shards with these episodes; empty: they end within a shard
     window: NonNegative[int] = 0  # episodes whose samples are shuffled together (training.shuffle_episodes); 0: all
-    seed: int | None = None  # seed of the order; None: unknown (checkpoints of 0.1.0)
+    seed: int = 0  # seed of the order
 
 
 class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand are drawn per second
@@ -111,7 +111,7 @@ class EpisodeSampler:
                 f"training.shuffle_episodes must be {self.state.window} to resume in the middle of epoch "
                 f"{self.state.epoch}, got {window}; set it so, or start another run"
             )
-        if self.state.position > 0 and self.state.seed not in (None, seed):
+        if self.state.position > 0 and self.state.seed != seed:
             raise ConfigError(
                 f"training.seed must be {self.state.seed} to resume in the middle of epoch {self.state.epoch}, got "
                 f"{seed}: samples would come twice; set it so, or start another run"

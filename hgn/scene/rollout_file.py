@@ -370,9 +370,9 @@ def _check_format(file: h5py.File, path: Path) -> None:
             f"rollout must be a file that python -m hgn.rollout wrote, with format {FORMAT_NAME!r} "
             f"in group /hgn; got {path} with format {name!r}"
         )
-    if not isinstance(version, np.integer) or version not in (1, FORMAT_VERSION):
+    if not isinstance(version, np.integer) or version != FORMAT_VERSION:
         raise ConfigError(
-            f"rollout format_version must be 1 or {FORMAT_VERSION}, got {version} in {path}; "
+            f"rollout format_version must be {FORMAT_VERSION}, got {version} in {path}; "
             "read it with the version of hgn that wrote it, or write it again"
         )
 
@@ -409,7 +409,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
         materials=tuple(json.loads(own.attrs["materials"])),
-        dimensions=np.asarray(own.attrs.get("dimensions", 3)).item(),  # missing in older files
+        dimensions=np.asarray(own.attrs["dimensions"]).item(),
     )
     for name, array in (("Points", rollout.position_TN3), ("reference", rollout.reference_TN3)):
         size = 0.0 if array is None else float(np.fmax.reduce(np.abs(array), axis=None, initial=0.0))

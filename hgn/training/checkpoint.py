@@ -73,7 +73,9 @@ class Progress:
     @staticmethod
     def of(checkpoint: dict[str, Any]) -> "Progress":
         section = current_names(checkpoint[SECTION])
-        state = from_stored(SamplerState, section.get("sampler_state"), "sampler_state")
+        remedy = "export a checkpoint of release 0.1.0 with 0.2.0"
+        require("sampler_state" in section, "checkpoint sampler_state", "given", None, remedy=remedy)
+        state = from_stored(SamplerState, section["sampler_state"], "sampler_state")
         counts = section.get("updates"), section.get("skipped", 0)
         whole = all(type(count) is int and 0 <= count < 2**63 for count in counts)
         require(whole, "checkpoint updates, skipped", "whole numbers", counts)

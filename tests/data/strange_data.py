@@ -20,7 +20,6 @@ from hgn.data.foreign.dataset import import_set
 from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.tfrecord import masked_crc
 from hgn.data.identity import identity_hash
-from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
 from hgn.scene.rollout_file import read_rollout, write_rollout
@@ -353,7 +352,7 @@ cases(
 
 def manifest(head=None, **changes):
     def make(folder):
-        Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([shard(0)])).save(folder)
+        Manifest(identity_hash({}), {}, {"train": 1}, 1).save(folder, [shard(0)])
         path = folder / "manifest.json"
         stored = json.loads(path.read_text())
         if head is not None:
@@ -408,7 +407,7 @@ def piped(name, device=None):
     """A pipe in the place of a file, or a device without an end."""
 
     def make(folder):
-        Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([shard(0)])).save(folder)
+        Manifest(identity_hash({}), {}, {"train": 1}, 1).save(folder, [shard(0)])
         (path,) = folder.rglob(name)
         path.unlink()
         path.symlink_to(device) if device else os.mkfifo(path)

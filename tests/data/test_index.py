@@ -1,21 +1,19 @@
 """The index of a data set: what a publication, a claim and a reader's start cost does not grow with the data set."""
 
 import dataclasses
-import json
 import os
 import re
 import sys
 from pathlib import Path
 
 import pytest
-from written_files import first_release, hashes
 
 import hgn.data.index
 import hgn.data.reader
 from datagen.pool.writer import DatasetWriter
-from hgn.data.entries import EpisodeEntry, ShardEntry
+from hgn.data.entries import EpisodeEntry, ShardEntry, totals_of
 from hgn.data.identity import dataset_identity, identity_hash
-from hgn.data.index import Index, ListedIndex, begin, extend
+from hgn.data.index import Index, begin, extend
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics
@@ -59,8 +57,7 @@ def listed(config, count):
     folder, identity = Path(config.dataset.folder), dataset_identity(config)
     folder.mkdir(parents=True)
     requested = {"train": config.dataset.training_scenes, "validation": 0, "test": 0}
-    shards = ListedIndex([shard(i) for i in range(count)])
-    Manifest(identity_hash(identity), identity, requested, count, shards).save(folder)
+    Manifest(identity_hash(identity), identity, requested, count).save(folder, map(shard, range(count)))
     return folder
 
 
@@ -117,15 +114,15 @@ def test_every_way_to_read(tmp_path, small_segments):
         assert list(fresh) == list(index) == shards and fresh[-1] == shards[-1] and fresh[2:5] == shards[2:5]
         assert list(fresh.since(7)) == shards[7:]
         assert [fresh.locate("train", i)[1].index for i in (10, 0, 5, 6)] == [10, 0, 5, 6]
-        whole = ListedIndex(shards)
-        assert [fresh.digest("train", i) for i in range(12)] == [whole.digest("train", i) for i in range(12)]
+        assert [fresh.digest("train", i) for i in range(12)] == [
+            totals_of(shards[:i])["train"].digest for i in range(12)
+        ]
         assert all(fresh.continues(before, "train") for before in earlier)
         assert fresh.particles("train", [10, 0, 5]) == [4306, 4296, 4301]
         assert earlier[0].particles("train", [0]) + index.particles("train", [9, 0]) == [4296, 4305, 4296]
         assert {name: (folder / name).stat().st_size for name, _ in fresh.files()} == dict(fresh.files())
-    other = ListedIndex([*shards[:4], dataclasses.replace(shards[4], sha256="a" * 64)])
-    assert whole.continues(ListedIndex(shards[:4]), "train") and not whole.continues(other, "train")
-    assert whole.locate("train", 10)[0] == shards[10]
+    changed = [*shards[:4], dataclasses.replace(shards[4], sha256="a" * 64)]
+    assert not fresh.continues(extend(tmp_path, begin(tmp_path), changed), "train")
 
 
 def test_what_was_not_published_is_written_over(tmp_path, small_segments):
@@ -138,30 +135,16 @@ def test_what_was_not_published_is_written_over(tmp_path, small_segments):
 
 def test_a_list_that_is_written_anew_again(tmp_path, monkeypatch):
     """Writers that end before the head of a list written anew, several of them, leave what the head lists."""
-    manifest = Manifest(identity_hash({}), {}, {"train": 2}, 2, ListedIndex([shard(0), shard(1)]))
-    manifest.save(tmp_path)
+    shards = [shard(0), shard(1)]
+    manifest = Manifest(identity_hash({}), {}, {"train": 2}, 2).save(tmp_path, shards)
     with monkeypatch.context() as patch:
         patch.setattr("hgn.data.manifest.write_atomically", lambda path, content: 1 / 0)
         for _ in range(3):
             with pytest.raises(ZeroDivisionError):
-                manifest.save(tmp_path)
-            assert list(Manifest.load(tmp_path).shards) == list(manifest.shards)
-    manifest.save(tmp_path)
-    assert len(manifest.save(tmp_path).shards) == 2 and len({*(tmp_path / "index").glob("*-000000.jsonl")}) <= 3
-
-
-def test_first_releases_manifest_is_gone_on_with(make_config, make_dataset):
-    """A manifest that lists the shards itself reads like one with an index; the next publication writes that."""
-    folder = make_dataset(make_config(training_scenes=3))
-    indexed = Manifest.load(folder)
-    first_release(folder)
-    manifest = Manifest.load(folder)
-    assert manifest == indexed and manifest.totals == indexed.totals and manifest.complete
-    assert [episode.key for episode in EpisodeStore(folder, "train")] == [f"train-{i:06d}" for i in range(3)]
-    before = hashes(folder)
-    make_dataset(make_config())
-    assert before.items() <= hashes(folder).items() and Manifest.load(folder).published("train") == 5
-    assert "shards" not in json.loads((folder / "manifest.json").read_text())
+                manifest.save(tmp_path, shards)
+            assert list(Manifest.load(tmp_path).shards) == shards
+    manifest.save(tmp_path, shards)
+    assert len(manifest.save(tmp_path, shards).shards) == 2 and len({*(tmp_path / "index").glob("*-000000.jsonl")}) <= 3
 
 
 @pytest.mark.parametrize(

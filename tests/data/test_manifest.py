@@ -9,12 +9,10 @@ import math
 import operator
 
 import pytest
-from written_files import first_release
 
 from datagen.pool.writer import DatasetWriter
 from datagen.service.server import Published
 from hgn.data.identity import dataset_identity, identity_differences, identity_hash
-from hgn.data.index import ListedIndex
 from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics
@@ -22,25 +20,17 @@ from hgn.schema import ConfigError
 from hgn.system import files
 
 
-def make_manifest():
+def test_roundtrip(tmp_path):
+    """Saving and loading returns every field, floats bitwise; what is published is counted."""
     entry = EpisodeEntry("train-000000", 0, 2**62, 1, 4296, 300, {"position.npy": (512, 15_465_728)})
     moments = Moments(7, (0.1, -0.2, 1e-300), (1 / 3, 0.0, 2.0))
     shard = ShardEntry("train-000000-000001.tar", "train", 0, 1, "ab" * 32, 999, (entry,), Statistics(moments))
-    config = {"scene": {"gravity": [0.0, -9.8, 0.0]}}
-    return Manifest(
-        config_hash=identity_hash(config),
-        config=config,
-        requested={"train": 1, "validation": 1, "test": 0},
-        revision=3,
-        shards=ListedIndex([shard], [QuarantinedScene("train-000000", 0, 5, "diverged")]),
-    )
-
-
-def test_roundtrip(tmp_path):
-    """Saving and loading returns every field, floats bitwise; what is published is counted."""
-    manifest = make_manifest()
-    manifest.save(tmp_path)
-    assert Manifest.load(tmp_path) == manifest and Manifest.load(tmp_path).quarantined == manifest.quarantined
+    config, requested = {"scene": {"gravity": [0.0, -9.8, 0.0]}}, {"train": 1, "validation": 1, "test": 0}
+    failures = [QuarantinedScene("train-000000", 0, 5, "diverged")]
+    saved = Manifest(identity_hash(config), config, requested, 3).save(tmp_path, [shard], failures)
+    manifest = Manifest.load(tmp_path)
+    assert manifest == saved and list(manifest.shards) == [shard] and manifest.quarantined == failures
+    assert (manifest.config, manifest.requested, manifest.revision) == (config, requested, 3)
     assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "index"}
     assert (manifest.published("train"), manifest.published("validation")) == (1, 0) and not manifest.complete
     assert dataclasses.replace(manifest, requested={"train": 1}).complete
@@ -85,7 +75,7 @@ def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeyp
 
 
 CUT = r"manifest\.json must be JSON .* run the generator again without manifest.json"
-FAULTS = [  # the place in a manifest of the first release, its value or what is done to it, the message
+FAULTS = [  # the place in a manifest or in a line of its index, its value, the message
     *(("", content, CUT) for content in (b"", b"{", b"\xff\xfe")),
     ("schema_version", 2, "schema_version must be 1, got 2; .* or use the version that made it"),
     ("colour", 1, "colour is not a known key"),
@@ -97,17 +87,17 @@ FAULTS = [  # the place in a manifest of the first release, its value or what is
         for value in ("x", [6], None, 6.0, 0)
     ),
     ("requested.dev", 1, "requested must be of train, validation, test"),
-    ("shards", lambda shards: shards.append(shards[0]), "must be listed once, got its episodes twice"),
-    ("shards.0.bytes", None, r"shards\[0\]\.bytes must be a whole number"),
-    ("shards.0.bytes", -1, r"shards\[0\]\.bytes must be a finite number >= 0"),
+    ("index", None, r"index must be given, got None; release 0\.1\.0 listed the shards here"),
+    ("shards.0.bytes", None, r"jsonl\.bytes must be a whole number"),
+    ("shards.0.bytes", -1, r"jsonl\.bytes must be a finite number >= 0"),
     ("shards.0.statistics.velocity.mean", [math.nan, 0, 0], "must be JSON .* got NaN"),
     ("shards.0.statistics.velocity.count", -1, "must be finite, with count"),
     # names and hashes become paths: what could lead elsewhere is refused
-    ("shards.0.name", "../../etc/passwd", r"shards\[0\]\.name must be a plain file name"),
-    ("shards.0.name", ".lock", r"shards\[0\]\.name must be a plain file name"),
-    ("shards.0.sha256", "../" * 10 + "evil", r"shards\[0\]\.sha256 must be 64 hexadecimal digits"),
-    ("shards.0.split", "../train", r"shards\[0\]\.split must be one of"),
-    ("shards.4.episodes", lambda episodes: episodes.pop(), r"episodes must be numbers 2 to 3, got \[2\]"),
+    ("shards.0.name", "../../etc/passwd", r"jsonl\.name must be a plain file name"),
+    ("shards.0.name", ".lock", r"jsonl\.name must be a plain file name"),
+    ("shards.0.sha256", "../" * 10 + "evil", r"jsonl\.sha256 must be 64 hexadecimal digits"),
+    ("shards.0.split", "../train", r"jsonl\.split must be one of"),
+    ("shards.0.episodes", [], r"episodes must be numbers 0 to 0, got \[\]"),
     # what the shard contradicts is never read out of range
     ("shards.0.episodes.0.seed", 1, "must have seed, particles, frames"),
     ("shards.0.episodes.0.members", {"position.npy": [10**9, 4]}, "must lie within"),
@@ -119,12 +109,25 @@ FAULTS = [  # the place in a manifest of the first release, its value or what is
 def test_faulty_manifests_are_refused(folder, place, value, message):
     """What is no JSON, of another schema or type, contradicts itself or its shards, or leads out of the folder, is
     refused by name."""
-    content = first_release(folder)
-    path = folder / "manifest.json"
-    if place:
-        *parents, key = (int(word) if word.isdigit() else word for word in place.split("."))
-        owner = functools.reduce(operator.getitem, parents, content)
-        value(owner[key]) if callable(value) else owner.update({key: value})
-    path.write_bytes(json.dumps(content).encode() if place else value)
+    path, lines = folder / "manifest.json", folder / "index" / "1-000000.jsonl"
+    stored = json.loads(path.read_bytes())
+    shards = [json.loads(line) for line in lines.read_text().splitlines()]
+    *parents, key = (int(word) if word.isdigit() else word for word in place.split("."))
+    owner = functools.reduce(operator.getitem, parents, stored | {"shards": shards} if parents else stored)
+    owner[key] = value
+    if value is None and key == "index":
+        del stored["index"]
+    lines.write_text("".join(json.dumps(shard) + "\n" for shard in shards))
+    if "index" in stored:
+        stored["index"]["segment_bytes"] = lines.stat().st_size
+    path.write_bytes(json.dumps(stored).encode() if place else value)
     with pytest.raises(ConfigError, match=message):
+        _ = EpisodeStore(folder, "train")[0]
+
+
+def test_shards_that_are_listed_twice(folder):
+    """The same episodes in two lines are refused."""
+    manifest = Manifest.load(folder)
+    manifest.save(folder, [*manifest.shards, manifest.shards[0]])
+    with pytest.raises(ConfigError, match="must be listed once, got its episodes twice"):
         _ = EpisodeStore(folder, "train")[0]

@@ -13,7 +13,6 @@ import hgn.data.verification
 from datagen.pool.writer import DatasetWriter
 from hgn.config import SceneConfig
 from hgn.data.identity import identity_hash
-from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.verification import file_sha256, verify_file
@@ -36,7 +35,7 @@ def test_positions_are_read_only(folder):
 def test_a_shard_of_no_bytes(tmp_path):
     """A manifest that lists an empty file is refused with a message."""
     empty = dataclasses.replace(shard(0), sha256=hashlib.sha256().hexdigest(), bytes=0)
-    Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([empty])).save(tmp_path)
+    Manifest(identity_hash({}), {}, {"train": 1}, 1).save(tmp_path, [empty])
     (tmp_path / empty.name).touch()
     with pytest.raises(ConfigError, match="must lie within 0 bytes"):
         EpisodeStore(tmp_path, "train")[0]
@@ -84,12 +83,12 @@ def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_
     """A folder whose data set was replaced, or lost shards, is not read on as if nothing had happened."""
     store = EpisodeStore(folder, "train")
     manifest = Manifest.load(folder)
-    dataclasses.replace(manifest, shards=ListedIndex(manifest.shards[1:])).save(folder)
+    manifest.save(folder, manifest.shards[1:])
     with pytest.raises(ConfigError, match="must keep the train shards already published"):
         store.refresh()
     other = make_config(folder=str(tmp_path / "other"))
     made = make_dataset(dataclasses.replace(other, scene=SceneConfig(obstacle_count=1)))
-    Manifest.load(made).save(folder)
+    Manifest.load(made).save(folder, [])
     with pytest.raises(ConfigError, match="must contain the same data set as before"):
         store.refresh()
 

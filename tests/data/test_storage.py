@@ -105,7 +105,7 @@ def test_manifest_is_sent_once(folder, serve, monkeypatch):
     monkeypatch.setattr(files, "cat_file", lambda *a, **k: sizes.append(len(data := real(*a, **k))) or data)
     assert not store.refresh()
     manifest = Manifest.load(folder)
-    dataclasses.replace(manifest, revision=99).save(folder)
+    dataclasses.replace(manifest, revision=99).save(folder, manifest.shards)
     assert not store.refresh() and store.manifest.revision == 99
     assert sizes[0] == 0 and sizes[1] > 1000
 

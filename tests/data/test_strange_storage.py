@@ -21,7 +21,6 @@ from datagen.pool.shard import inspect_shard
 from hgn import evaluate, export, rollout, train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data import storage
-from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.sampler import Sample, SamplerState
@@ -93,9 +92,7 @@ def test_a_claim_that_its_server_denies_empties_no_cache(data, tmp_path, monkeyp
     folder.mkdir(parents=True)
     for number in range(20):
         (folder / f"{number:064x}.tar").write_bytes(bytes(1000))
-    replace(manifest, shards=ListedIndex([replace(s, bytes=Shards.claim) for s in manifest.shards])).save(
-        data.dataset.folder
-    )
+    manifest.save(data.dataset.folder, [replace(shard, bytes=Shards.claim) for shard in manifest.shards])
     server = answering(functools.partial(Shards, directory=data.dataset.folder))
     with server as url, pytest.raises(ConfigError, match="must have "):
         EpisodeStore(url, "train")[0]
@@ -323,7 +320,7 @@ def with_change(folder, split, change):
     change(content, shards[place].episodes[0].members)
     path.write_bytes(content)
     shards[place] = replace(shards[place], sha256=hashlib.sha256(content).hexdigest())
-    replace(manifest, shards=ListedIndex(shards)).save(folder)
+    manifest.save(folder, shards)
     return path.name
 
 

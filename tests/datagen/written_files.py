@@ -2,14 +2,12 @@
 and a progress that remembers."""
 
 import hashlib
-import json
 from pathlib import Path
 
 from datagen.pool.locks import LOCK_NAME
 from datagen.pool.progress import Progress
 from hgn.data.index import INDEX_NAME
 from hgn.data.manifest import MANIFEST_NAME, Manifest
-from hgn.schema import to_mapping
 
 
 def hashes(folder):
@@ -35,15 +33,6 @@ def differences(one, other):
         own |= {Path(name).name for name, _ in manifest.shards.files()}
     names = contents[0].keys() | contents[1].keys()
     return sorted(name for name in names - own if contents[0].get(name) != contents[1].get(name))
-
-
-def first_release(folder):
-    """Writes the manifest as the first release had it, and returns its content."""
-    manifest = Manifest.load(folder)
-    mapping = {name: value for name, value in vars(manifest).items() if name != "shards"}
-    mapping |= {"shards": to_mapping(list(manifest.shards)), "quarantined": to_mapping(manifest.quarantined)}
-    (folder / "manifest.json").write_text(json.dumps(mapping))
-    return mapping
 
 
 def simulated(control):

@@ -30,7 +30,7 @@ from hgn.data.foreign.formats import read_split, set_info
 from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
 from hgn.data.identity import identity_hash
-from hgn.data.index import ListedIndex, parse_json
+from hgn.data.index import parse_json
 from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
 from hgn.network.build import build_network
@@ -98,7 +98,7 @@ def test_cards_show_names_as_words(name):
 @pytest.mark.parametrize("config", [{}, {"scene": 3}, {"imported": {}}, {"imported": 5, "frame_rate_hz": "x"}])
 def test_configs_of_other_data_sets(tmp_path, config):
     """A manifest whose config is none of this version ends in one line: of a card, and of a training on it."""
-    Manifest(identity_hash(config), config, {"train": 1}, 1, ListedIndex([shard(0)])).save(tmp_path)
+    Manifest(identity_hash(config), config, {"train": 1}, 1).save(tmp_path, [shard(0)])
     sections = {name: {} for name in ("network", "training", "scene")}
     mapping = {"dataset": {"folder": str(tmp_path)}, "imported": True, **sections}
     for read in (lambda: card.main({"data": str(tmp_path)}), lambda: settings_of_imported(mapping)):
@@ -272,8 +272,8 @@ def index(name):
     """A file of a data set's index: all that it lists is read, and looked up."""
     folder = Path(LISTED.name, name.strip("*"))
     folder.mkdir()
-    shards = ListedIndex([shard(0), shard(1)], [QuarantinedScene("train-000000", 0, 7, "too stiff")])
-    Manifest(identity_hash({}), {}, {"train": 2}, 2, shards).save(folder)
+    failures = [QuarantinedScene("train-000000", 0, 7, "too stiff")]
+    Manifest(identity_hash({}), {}, {"train": 2}, 2).save(folder, [shard(0), shard(1)], failures)
     (path,) = folder.rglob(name)
     content = path.read_bytes()
 

@@ -77,22 +77,13 @@ def array(name, value):
     return change
 
 
-def test_files_of_other_programs_and_versions(tmp_path):
+def test_files_of_other_programs(tmp_path):
     """A file is read with the names of materials that it brings, more or others than the solver's, and keeps that all
-    lies in a plane; older ones do not tell, and have three dimensions. Files of format 1 had no obstacles in /VTKHDF.
-    """
+    lies in a plane."""
     for names in (["water", "sand", "snow"], ["water", "sand", "snow", "goop"]):
         assert stored(tmp_path, make_rollout(), attribute("materials", json.dumps(names))).materials == tuple(names)
     flat = dataclasses.replace(make_rollout(), dimensions=2)
     assert stored(tmp_path, flat).dimensions == 2
-    assert stored(tmp_path, flat, lambda file: file["hgn"].attrs.pop("dimensions")).dimensions == 3
-
-    def first_format(file):
-        del file["VTKHDF/CellData"], file["VTKHDF/Steps/CellDataOffsets"]
-        file["hgn"].attrs["format_version"] = 1
-
-    read = stored(tmp_path, dataclasses.replace(flat, obstacles=()), first_format)
-    np.testing.assert_array_equal(read.position_TN3, flat.position_TN3)
 
 
 def test_particles_that_enter(tmp_path):
@@ -263,14 +254,14 @@ def external_points(file):
     ("change", "message"),
     [
         (lambda file: file["hgn"].attrs.pop("format"), "format None"),
-        (attribute("format_version", 99), "format_version must be 1 or 2, got 99"),
+        (attribute("format_version", 99), "format_version must be 2, got 99"),
         (attribute("dimensions", 4), r"dimensions must be 2 or 3, got 4; write it again"),
         (attribute("materials", '["water"]'), r"material_N must be 0 to 0"),
         (attribute("materials", '["A B", "A B"]'), "materials must be names of lower-case"),
         (array("VTKHDF/Points", np.zeros((5, 3), np.float32)), "4 frames of 7 particles"),
         (lambda file: file.pop("VTKHDF/Points"), r"must be a complete HDF5 file, got .*Points"),
         (attribute("format", np.array([1, 2])), "with format array"),
-        (attribute("format_version", "x"), "format_version must be 1 or 2, got x"),
+        (attribute("format_version", "x"), "format_version must be 2, got x"),
         (attribute("domain_size", np.array([np.nan, 1, 1])), r"domain_size\[0\] must be from 1e-9 to 1e9, got nan"),
         (attribute("domain_size", np.array([1.0, 1.0])), "must be a complete HDF5 file, got not enough values"),
         (attribute("gravity", np.array([0, np.inf, 0])), r"gravity\[1\] must be finite, got inf"),

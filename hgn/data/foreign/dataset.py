@@ -16,7 +16,6 @@ from hgn.data.foreign.gravity import estimate_gravity
 from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.trajectory import SetInfo, Trajectory
 from hgn.data.identity import identity_hash
-from hgn.data.index import ListedIndex
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
 from hgn.data.statistics import Statistics, episode_statistics
@@ -75,7 +74,7 @@ def import_set(
         "seed": 0,
     }
     requested = {split: sum(len(shard.episodes) for shard in shards if shard.split == split) for split in SPLITS}
-    manifest = Manifest(identity_hash(identity), identity, requested, len(shards), ListedIndex(shards)).save(out)
+    manifest = Manifest(identity_hash(identity), identity, requested, len(shards)).save(out, shards)
     return manifest, converter.note_on_bounds(sum(requested.values()))
 
 
