@@ -29,6 +29,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/.created
 	$(INSTALL) -e '.[dev]'
 	$(COMPILE)
 	@touch $@ $(VENV)/.demo
+	@echo "installed; '. $(VENV)/bin/activate', and 'python -m hgn.rollout' simulates a scene"
 
 # what the demo needs alone: the tests' packages are larger
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/.created
@@ -66,20 +67,21 @@ soak: setup
 
 check: setup format lint types layers docs test slow
 
-format:
+format: setup
 	$(RUN) -m ruff format --check
 
-lint:
+lint: setup
 	$(RUN) -m ruff check
 
-types:
+types: setup
 	$(RUN) -m mypy
 
-layers:
+layers: setup
 	$(VENV)/bin/lint-imports
 
 docs: setup
 	$(RUN) -m sphinx -W --keep-going -n -q -b html docs docs/_build
+	@echo "docs/_build/index.html"
 
 # a simulation as a page that plays by itself, which the docs show where it is
 film: setup

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_996,
+    "hgn": 33_998,
     "datagen": 8_937,
-    "tools": 6_352,
-    "tests": 34_750,
+    "tools": 6_356,
+    "tests": 34_783,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -9,6 +9,7 @@ If `rollout` is the name of a scene in conf/gallery, the solver simulates the sc
 simulate it too: `python -m tools.render rollout=pool_deep 'others=[mechanics]'`.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -131,6 +132,9 @@ def _load(config: RenderConfig) -> Versions:
         rule = f"{rollout.frame_rate_hz:g} frames a second"
         if other.frame_rate_hz != rollout.frame_rate_hz:
             raise ConfigError(f"others[{i}] must have {rule}, got {other.frame_rate_hz:g}")
+        if other.frame_count != rollout.frame_count:
+            counts = f"{file} has {other.frame_count} frames, {first} has {rollout.frame_count}"
+            print(f"{counts}: pictures have {rollout.frame_count}", file=sys.stderr)
         others[other_name] = other.position_TN3
     return Versions(rollout, label, others, truth_TN3)
 

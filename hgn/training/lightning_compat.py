@@ -43,7 +43,8 @@ _ODD_PARTS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticErro
 
 def quieten() -> None:
     """Silences messages and hints of Lightning, because the commands print their own."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for package in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(package).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")
     warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu was chosen on purpose

@@ -73,7 +73,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     devices, nodes = layout(training)
     backend, precisions, text = _backend(config, resume)
     if first_rank():
-        print(text, file=sys.stderr)
+        print(text if devices * nodes == 1 else f"{text}, {devices * nodes} processes", file=sys.stderr)
         if not config.dataset.validation_scenes and not len(store.of_split("validation")):
             print(
                 f"no validation scenes: there will be no {BEST_NAME}, nor errors and pictures of them", file=sys.stderr

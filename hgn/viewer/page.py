@@ -198,7 +198,8 @@ class PlayPage:
         with gui.add_folder("Pour"):
             self.material = gui.add_dropdown("Material", self._materials())
             self.diameter = gui.add_slider("Diameter", 0.02, 0.3, 0.01, 0.08)
-            self.speed = gui.add_slider("Speed", 0.0, 3.0, 0.1, 1.0)
+            slow = session.simulator.device.type == "cpu"  # one stroke would fill a CPU's limit of particles
+            self.speed = gui.add_slider("Speed", 0.0, 3.0, 0.1, 0.5 if slow else 1.0)
             self.height = gui.add_slider("Height", 0.1, 1.0, 0.05, 0.75)
             gui.add_markdown(HELP)
         with gui.add_folder("Obstacles"):

@@ -67,7 +67,7 @@ def test_an_episode_and_rollouts_beside_it(tmp_path, small_dataset):
 
 def test_other_rollouts_stand_beside_it(tmp_path, capsys):
     """A folder gets the grid, the animation and, with ground truth, the error; each path is printed. Each other rollout
-    has a row and a column of its own; one of another scene is refused."""
+    has a row and a column of its own; one of another scene is refused. One of another length is drawn with a note."""
     path = rollout_file(tmp_path, True)
     (tmp_path / "other").mkdir()
     other, wanted = rollout_file(tmp_path / "other", False), ["fall.png", "fall.gif", "fall_error.png"]
@@ -83,6 +83,11 @@ def test_other_rollouts_stand_beside_it(tmp_path, capsys):
             sizes.append((still.height, moving.width))
     assert sizes[1][0] > sizes[0][0] + 60 and sizes[1][1] > sizes[0][1] + 60
     rollout, bad = read_rollout(other), {"rollout": str(path), "others": [str(other)], "out": str(tmp_path / "bad")}
+    for count in (1, 12):
+        write_rollout(other, dataclasses.replace(rollout, position_TN3=rollout.position_TN3.repeat(2, axis=0)[:count]))
+        main(bad | {"out": str(tmp_path / "a.png"), "size": 80})
+        line = f"{other} has {count} frames, {path} has {FRAMES}: pictures have {FRAMES}\n"
+        assert capsys.readouterr().err == line
     for change, message in (
         ({"gravity": (0.0, -1.6, 0.0)}, r"others\[0\] must have the obstacles and the gravity of"),
         ({"frame_rate_hz": 30.0}, r"others\[0\] must have 60 frames a second, got 30"),

@@ -1,6 +1,9 @@
 """What hgn.training.lightning_compat takes for granted of Lightning."""
 
+import logging
+
 import pytest
+from lightning.fabric.utilities import distributed
 from lightning.pytorch import Trainer
 from lightning.pytorch.plugins.environments import LightningEnvironment, SLURMEnvironment, TorchElasticEnvironment
 from lightning.pytorch.strategies import DDPStrategy
@@ -9,8 +12,10 @@ from hgn.training import lightning_compat
 
 
 def test_canary():
-    """The private parts that are replaced exist, and only backend torch is wrapped in DistributedDataParallel."""
+    """The private parts that are replaced exist, and only backend torch is wrapped in DistributedDataParallel. The
+    module that prints each process's rank is silent."""
     lightning_compat.quieten()
+    assert distributed.log.isEnabledFor(logging.WARNING) and not distributed.log.isEnabledFor(logging.INFO)
     trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
     loop = trainer.fit_loop.epoch_loop
     assert callable(loop._broadcast_sigterm_tensor)

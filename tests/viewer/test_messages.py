@@ -125,6 +125,11 @@ def test_messages_that_are_not_of_the_page(page, monkeypatch, message, passes):
     assert (after != before or bool(asked)) == passes
 
 
+def test_pouring_on_a_cpu_is_slow_by_default(page):
+    """One stroke of full speed would fill the 8,000 particles of a CPU within two seconds."""
+    assert controls(page)["Speed"].value == 0.5
+
+
 CAMERA = viser_compat.messages.ViewerCameraMessage(
     (1.0, 0.0, 0.0, 0.0), (0.5, 0.9, 2.0), 1.0, 0.01, 100.0, 600, 900, (0.5, 0.4, 0.5), (0.0, 1.0, 0.0)
 ).as_serializable_dict()
