@@ -16,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_998,
+    "hgn": 33_979,
     "datagen": 8_937,
-    "tools": 6_356,
+    "tools": 6_347,
     "tests": 34_783,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config

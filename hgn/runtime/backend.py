@@ -37,18 +37,12 @@ class CpuBackend(Backend):
         return cpu_network.prediction(self.network, state, origin_S3)
 
 
-def choose(
-    device: torch.device,
-    network: ParticleNetwork,
-    precision: str = "auto",
-    backend: str = "auto",
-    field: str = "backend",
-) -> Backend:
+def choose(device: torch.device, network: ParticleNetwork, precision: str = "auto", backend: str = "auto") -> Backend:
     """Returns the named backend, or with `auto` the fastest supported one. Its `note` reports the choice and why.
 
-    Raises: ConfigError naming `field` for an unknown backend, or with the reason why it is not supported here.
+    Raises: ConfigError for an unknown backend, or with the reason why it is not supported here.
     """
-    for name, value, known in ((field, backend, BACKENDS), ("precision", precision, ("auto", *PRECISIONS))):
+    for name, value, known in (("backend", backend, BACKENDS), ("precision", precision, ("auto", *PRECISIONS))):
         require(value in known, name, f"one of {', '.join(known)}", value)
     config = network.config
     reasons = {
@@ -56,7 +50,7 @@ def choose(
         "cpu": cpu_unsupported_reason(device, config, precision),
         "torch": torch_unsupported_reason(precision),
     }
-    name, report = pick(reasons, backend, precision, field)
+    name, report = pick(reasons, backend, precision, "backend")
     chosen = build(name, network, precision)
     chosen.note = f"{report}, precision {chosen.precision}"
     if name == "cpu":

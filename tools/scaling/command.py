@@ -80,7 +80,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     work = ("backend", "precision", "devices", "scenes", "particle_spread")
     lines = []
     for row in rows:
-        averaged = "no" if not row["averaged"] else "in the graph" if row["one_graph"] else "yes"
+        averaged = "yes" if row["averaged"] else "no"
         times = report.number(row["ms"], ".2f"), report.spread(row.get("ms_quartiles"), ".2f")
         lines.append(
             (*(row[key] for key in work), averaged, *times, report.number(row["efficiency"], ".3f"), row["check"])

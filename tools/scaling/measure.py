@@ -5,7 +5,6 @@ and Adam. Lightning, logging and reading of data are not included.
 """
 
 import datetime
-import gc
 import itertools
 import json
 import time
@@ -57,7 +56,6 @@ class Contender(Timed):
     averaged: bool
     spread: float  # as SPREAD, for the timed scenes
     particles: float  # mean number of particles of one update on each device
-    one_graph: bool = False  # the gradients' average is in the CUDA graph of the update
     update: "TorchUpdates | TritonUpdates | None" = None  # None in processes that only wait
     check: str = PASS
     milliseconds: list[float] = field(default_factory=list)  # times of one update
@@ -88,7 +86,7 @@ class TorchUpdates:
         self.loss: nn.Module = _Loss(network, training)
         self.parameters = list(network.parameters())
 
-    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> None:
+    def average(self, group: dist.ProcessGroup) -> None:
         """Averages gradients over the ranks of `group` from now on."""
         devices = [self.device] if self.device.type == "cuda" else None
         self.loss = DistributedDataParallel(self.loss, devices, process_group=group, **averaging_options())
@@ -121,10 +119,10 @@ class TritonUpdates:
         self.chunk = [device_samples(batch) for batch in batches]
         self.rates = [TrainingConfig.learning_rate] * len(self.chunk)
 
-    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> None:
+    def average(self, group: dist.ProcessGroup) -> None:
         """Averages gradients over the ranks of `group` from now on."""
         reduce = partial(dist.all_reduce, group=group)
-        self.ours = self.make(reduce, dist.get_world_size(group), one_graph=one_graph)
+        self.ours = self.make(reduce, dist.get_world_size(group))
         self.gradients()
 
     def run(self) -> None:
@@ -178,11 +176,6 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
     if rank == 0:
         (folder / "rows.json").write_text(json.dumps([_row(c, config, device) for c in contenders]))
     dist.barrier()
-    # Destroying a group waits for ever while a CUDA graph contains its messages. After an error the traceback keeps the
-    # graphs, so the process then ends without destroying the group.
-    for contender in contenders:
-        contender.update = None
-    gc.collect()
     dist.destroy_process_group()
 
 
@@ -199,10 +192,9 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
         for size, averaged, spread in itertools.product(sizes, (False, True), (0.0, SPREAD)):
             if averaged == (size > 1) or (not averaged and spread == 0):
                 particles = float(_particles(config, size, spread).sum(-1).mean())
-                for one_graph in (False, True) if backend == "triton" and averaged else (False,):
-                    contender = Contender(backend, size, averaged, spread, particles, one_graph)
-                    contender.batches, contender.warm_up = config.batches, -(-WARM_UPDATES // config.batches)
-                    contenders.append(contender)
+                contender = Contender(backend, size, averaged, spread, particles)
+                contender.batches, contender.warm_up = config.batches, -(-WARM_UPDATES // config.batches)
+                contenders.append(contender)
     return contenders
 
 
@@ -244,7 +236,7 @@ def _average(contender: Contender, group: dist.ProcessGroup) -> None:
     expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
     expected /= dist.get_world_size(group)
-    contender.update.average(group, contender.one_graph)
+    contender.update.average(group)
     error = relative_error(contender.update.gradients(), expected)
     if not error <= GRADIENT_BOUND:
         contender.check = f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}"
@@ -292,7 +284,6 @@ def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> d
         "spread": "random" if contender.spread else "equal",
         "particles_per_update": contender.particles,
         "averaged": contender.averaged,
-        "one_graph": contender.one_graph,
         "check": contender.check,
         "ms": None,
     }

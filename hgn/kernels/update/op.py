@@ -136,15 +136,10 @@ class Updates:
         reduce: Callable[[torch.Tensor], None] | None = None,
         ranks: int = 1,
         capacities: tuple[int, ...] = (),
-        one_graph: bool = False,
     ) -> None:
-        """Takes the initial number of cells of each level from `capacities`, or measures it at the first update.
-
-        With `one_graph` a CUDA graph contains `reduce` too, which must not communicate during the capture.
-        """
+        """Takes the initial number of cells of each level from `capacities`, or measures it at the first update."""
         self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
-        self.one_graph = one_graph
         self.device = device = next(network.parameters()).device
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
@@ -273,7 +268,7 @@ class Updates:
     def _replay(self) -> None:
         if self.device.type == "cuda" and not self._graphs:
             self._capture()
-        if self.reduce is None or len(self._graphs) == 1:
+        if self.reduce is None:
             self._graphs[0].replay() if self._graphs else self.launches()
             return
         self._graphs[0].replay() if self._graphs else self.launches_before_reduction()
@@ -291,12 +286,6 @@ class Updates:
     def launches(self) -> None:
         """Makes all launches of one update, without communication with other ranks."""
         self.launches_before_reduction()
-        self.launches_after_reduction()
-
-    def _launches_together(self) -> None:
-        assert self.reduce is not None
-        self.launches_before_reduction()
-        self.reduce(self.fused.totals)
         self.launches_after_reduction()
 
     def launches_before_reduction(self) -> None:
@@ -432,9 +421,7 @@ class Updates:
 
     def _capture(self) -> None:
         begun = time.monotonic()
-        parts = [self.launches_before_reduction, self.launches_after_reduction]
-        if self.reduce is None or self.one_graph:
-            parts = [self.launches if self.reduce is None else self._launches_together]
+        parts = [self.launches_before_reduction, self.launches_after_reduction] if self.reduce else [self.launches]
 
         def warm_up() -> None:
             self.grid.status.fill_(kernel.REPEAT.value)  # with this status launches are compiled but change nothing
