@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_979,
     "datagen": 8_937,
-    "tools": 6_347,
-    "tests": 34_783,
+    "tools": 6_348,
+    "tests": 34_785,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

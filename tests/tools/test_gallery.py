@@ -79,6 +79,8 @@ def test_observables():
         assert series(film, bound_of(name))[0] == pytest.approx(value, rel=1e-3), name
     assert series(film, bound_of("moved", along=(2.0, 0, 0)))[0] == pytest.approx(5 / 60 * 0.3, rel=1e-3)
     assert series(film, bound_of("moved", along=(2.0, 0, 0), since=5))[1] == pytest.approx(5 / 60 * 0.3, rel=1e-3)
+    for along, wide in (((0, 0, 1), 0.0), ((2.0, 0, 0), np.std([0.1, 0.11, 0.15]))):
+        assert series(film, bound_of("spread", along=along))[0] == pytest.approx(wide, abs=1e-6)
     assert series(film, bound_of("below", at=0.19)) == [1.0, 1.0]
     assert series(film, bound_of("beyond", at=0.14))[0] == pytest.approx(1 / 3)
     assert {*expected, "moved", "below", "beyond"} == OBSERVABLES.keys()

@@ -34,7 +34,7 @@ class BoundEntry:
     times: tuple[float, float] | None = None
     within: NonNegative[float] | None = None
     group: int | None = None  # only the particles of this group, counted from 0; null: all
-    along: Vector | None = None  # direction of moved; also of centre, front and beyond, in place of x
+    along: Vector | None = None  # direction of moved; also of centre, front, spread and beyond, in place of x
     at: float | None = None  # place of below and beyond, domain units
     since: NonNegative[int] = 0  # frame that moved and displacement are measured from
 
@@ -149,8 +149,9 @@ def crowding(film: Film, frame: int, _: BoundEntry) -> float:
     return (float(counts.mean()) - 1) / finer
 
 
-def spread(film: Film, frame: int, _: BoundEntry) -> float:
-    return float(np.sqrt(0.5 * film.place(frame)[:, [0, 2]].var(axis=0).sum()))
+def spread(film: Film, frame: int, bound: BoundEntry) -> float:
+    axes = np.eye(3)[[0, 2]] if bound.along is None else [_direction(bound)]
+    return float(np.sqrt((film.place(frame) @ np.transpose(axes)).var(axis=0).mean()))
 
 
 def centre(film: Film, frame: int, bound: BoundEntry) -> float:
@@ -231,7 +232,7 @@ OBSERVABLES: Mapping[str, Observable] = {
     "height": Observable(height, "cells", "mean height above the lower plane of the domain"),
     "top": Observable(top, "cells", "height that 98 % of the particles are below"),
     "crowding": Observable(crowding, "particles", "mean number of others within a cell, at the density of the file"),
-    "spread": Observable(spread, "domain units", "root mean square distance from the mean along x and z, of one axis"),
+    "spread": Observable(spread, "domain units", "root mean square distance from the mean along x and z, or `along`"),
     "centre": Observable(centre, "domain units", "mean place along x, or `along`"),
     "front": Observable(front, "domain units", "place along x, or `along`, that 99 % have not reached"),
     "squared_speed": Observable(squared_speed, "(domain units/s)²", "mean squared speed"),
@@ -248,7 +249,7 @@ OBSERVABLES: Mapping[str, Observable] = {
     ),
 }
 SINCE = ("moved", "displacement")
-DIRECTED = ("centre", "front", "beyond")  # along x, or `along`
+DIRECTED = ("centre", "front", "spread", "beyond")  # `along` is optional
 LACKS = {  # observables that some scenes do not have: whether one does not, and what it would need
     "energy_gain": (lambda scene, _: scene.emits, "particles that are all present from the start"),
     "momentum": (lambda scene, _: scene.emits, "particles that are all present from the start"),
