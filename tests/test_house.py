@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_979,
+    "hgn": 33_974,
     "datagen": 8_937,
     "tools": 6_348,
-    "tests": 34_785,
+    "tests": 34_790,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

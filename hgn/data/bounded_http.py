@@ -64,9 +64,7 @@ class BoundedResponse(aiohttp.ClientResponse):
                 size += len(piece)
                 if size > limit:
                     self.close()
-                    raise StorageError(
-                        f"{self.url} must answer with at most {limit} bytes, got more; check dataset.folder"
-                    )
+                    raise StorageError(f"{self.url} must send at most {limit} bytes, got more; check dataset.folder")
                 now = time.monotonic()
                 grace_s = min(grace_s + len(piece) / LEAST_BYTES_S, SILENCE_S) - (now - before)
                 before = now

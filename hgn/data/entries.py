@@ -12,7 +12,7 @@ from hgn.data.statistics import Moments, Statistics
 from hgn.schema import Bound, Bounded, ConfigError, NonNegative, require, require_bounds
 
 SPLITS = ("train", "validation", "test")
-REMEDY = "if it stays so, run the generator again without manifest.json: published shards are found and kept"
+REMEDY = "if this persists, run the generator again without manifest.json: published shards are found and kept"
 MOST = 10_000_000  # largest number of shards of a data set, and of episodes of a split
 Count = Annotated[int, Bound(f"from 0 to {MOST}", lambda value: 0 <= value <= MOST)]
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")

@@ -1,4 +1,4 @@
-"""Draws the seed of a fresh test set, which no choice has used, after the weights are frozen.
+"""Draws the seed of a fresh test set after the weights are frozen, so that no choice can depend on the set.
 
 `fresh.json` in the data set's folder stores it with their hashes. It is written once, before the first scene is made.
 """
@@ -47,11 +47,11 @@ def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
     fresh = read_fresh(folder)
     if fresh is None:
         chosen = (Path(folder) / MANIFEST_NAME).exists()
-        rule = f"left out: {folder} holds a data set whose seed was chosen before"
+        rule = f"left out, because the seed of the data set in {folder} was not drawn"
         require(not chosen, "frozen", rule, list(weights))
         fresh = FreshSeed(secrets.randbelow(2**31), datetime.now(UTC).isoformat(timespec="seconds"), hashes)
         write_json(Path(folder) / FRESH_NAME, to_mapping(fresh))
-    remedy = "weights that changed need another folder, and so another seed"
+    remedy = "changed weights need another folder, and thus another seed"
     require(fresh.weights == hashes, "frozen", f"the weights of {folder}/{FRESH_NAME}", list(weights), remedy)
     return fresh
 
@@ -64,7 +64,7 @@ def read_fresh(folder: Path | str) -> FreshSeed | None:
     try:
         return from_mapping(FreshSeed, json.loads(path.read_text()), str(path))
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} must be what python -m datagen frozen=… wrote, got {error}") from error
+        raise ConfigError(f"{path} must be a file that python -m datagen frozen=… wrote, got {error}") from error
 
 
 def set_record(folder: Path | str, seed: int, files: Iterable[Path]) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def identity_hash(identity: Mapping[str, Any]) -> str:
 
 
 def identity_differences(stored: Mapping[str, Any], requested: Mapping[str, Any], path: str = "") -> list[str]:
-    """Returns a line for each different key: `scene.obstacle_count is 5 there, 3 is asked for`."""
+    """Returns a line for each different key: `scene.obstacle_count is 5 there, 3 is requested`."""
     lines = []
     for key in sorted(stored.keys() | requested.keys()):
         name = f"{path}.{key}" if path else key
@@ -74,7 +74,7 @@ def identity_differences(stored: Mapping[str, Any], requested: Mapping[str, Any]
         if isinstance(left, Mapping) and isinstance(right, Mapping):
             lines += identity_differences(left, right, name)
         elif left != right:
-            lines.append(f"{name} is {left} there, {right} is asked for")
+            lines.append(f"{name} is {left} there, {right} is requested")
     return lines
 
 
@@ -87,6 +87,6 @@ def require_same_dataset(stored: Mapping[str, Any], config: DatagenConfig, folde
     if differences:
         shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
         raise ConfigError(
-            f"{folder} holds another data set: {shown}; choose another folder (out=... or dataset.folder=...) or the "
-            "same settings"
+            f"{folder} contains another data set: {shown}; choose another folder (out=... or dataset.folder=...) or "
+            "the same settings"
         )

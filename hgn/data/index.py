@@ -229,7 +229,7 @@ class Index(Sequence[ShardEntry]):
             try:
                 content = storage.read(name, start, stop) if stop > start else b""
             except FileNotFoundError:
-                raise StorageError(f"{self.folder}/{name} must be there, got no such file; {REMEDY}") from None
+                raise StorageError(f"{self.folder}/{name} must exist, got no such file; {REMEDY}") from None
             try:
                 rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
             except ConfigError as error:  # other bytes than were published, perhaps temporarily
@@ -275,7 +275,7 @@ class Index(Sequence[ShardEntry]):
                     for split, expected in (end.totals if end else self.totals).items():
                         if replace(expected, statistics=None) != later.totals[split]:
                             raise StorageError(
-                                f"{self.folder}/{self.state.path(number)} must hold the {split} shards that were "
+                                f"{self.folder}/{self.state.path(number)} must list the {split} shards that were "
                                 f"published, got others; {REMEDY}"
                             )
                     return later

@@ -106,7 +106,7 @@ class Manifest(_Identity):
             frames = head.config.get(key, 1)
             require(type(frames) is int and frames > 0, f"{path}.config.{key}", "a whole number > 0", frames)
         expected = identity_hash(head.config)
-        require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, as config has it", head.config_hash)
+        require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, config's hash", head.config_hash)
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 
     def save(
@@ -175,4 +175,4 @@ def errors_in_config(folder: Path | str) -> Iterator[None]:
     except ConfigError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(f"{folder} must have a config as this version writes it, got {error!r} of it") from error
+        raise ConfigError(f"{folder} must have a config that this version can read, got {error!r}") from error

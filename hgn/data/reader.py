@@ -116,7 +116,7 @@ class EpisodeStore(Episodes):
         try:
             before, self.manifest = len(self), self._later_manifest()
         except UnreachableError as error:
-            self._tell(f"{error.filename}: {error.strerror}; going on with {len(self)} episodes")
+            self._tell(f"{error.filename}: {error.strerror}; continuing with {len(self)} episodes")
             return False
         except (ConfigError, OSError) as error:
             patience_s = standard_patience_s()
@@ -128,7 +128,7 @@ class EpisodeStore(Episodes):
             if self._looked_s - since > patience_s:
                 raise StorageError(str(error)) from error
             if self._faulty_since is None:
-                self._tell(f"{error}; going on with {len(self)} episodes for {patience_s:.0f} s")
+                self._tell(f"{error}; continuing with {len(self)} episodes for {patience_s:.0f} s")
             self._faulty_since = since
             return False
         self._faulty_since = None
@@ -148,7 +148,7 @@ class EpisodeStore(Episodes):
         if manifest.config_hash != self.manifest.config_hash:
             raise ConfigError(
                 f"{self.folder} must contain the same data set as before, got config hash {manifest.config_hash[:12]} "
-                f"where {self.manifest.config_hash[:12]} was opened; start again"
+                f"instead of {self.manifest.config_hash[:12]}; start again"
             )
         manifest = replace(manifest, shards=self.manifest.shards.continued(manifest.shards))
         if not manifest.shards.continues(self.manifest.shards, self.split):
@@ -278,7 +278,7 @@ class EpisodeStore(Episodes):
         try:
             episode = read_episode(content, shard.name, entry.key, entry.members, scan_positions=scan)
         except ConfigError as error:
-            text = f"{self.folder}/{shard.name} must be a sound shard, got {error}; delete it, and {REMEDY}"
+            text = f"{self.folder}/{shard.name} must be a valid shard, got {error}; delete it, and {REMEDY}"
             raise StorageError(text) from None
         self._scanned.add(entry.key)
         config = self.manifest.config

@@ -109,12 +109,12 @@ class EpisodeSampler:
         if self.state.position > 0 and self.state.window != window:
             raise ConfigError(
                 f"training.shuffle_episodes must be {self.state.window} to resume in the middle of epoch "
-                f"{self.state.epoch}, got {window}; set it so, or start another run"
+                f"{self.state.epoch}, got {window}; use that value, or start another run"
             )
         if self.state.position > 0 and self.state.seed != seed:
             raise ConfigError(
                 f"training.seed must be {self.state.seed} to resume in the middle of epoch {self.state.epoch}, got "
-                f"{seed}: samples would come twice; set it so, or start another run"
+                f"{seed}: samples would repeat; use that value, or start another run"
             )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
@@ -162,17 +162,17 @@ class EpisodeSampler:
         frame_counts = list(self._published(epoch))
         if episodes > len(frame_counts):
             raise ConfigError(
-                f"data set must still hold the {episodes} training episodes that epoch {epoch} began with, "
+                f"data set must still contain the {episodes} training episodes that epoch {epoch} began with, "
                 f"got {len(frame_counts)}; restore the missing shards or training.more_data, or start another run"
             )
         frame_counts = frame_counts[: episodes or len(frame_counts)]
         if not frame_counts:
-            raise ConfigError("data set must hold at least one training episode, got none; generate some first")
+            raise ConfigError("data set must contain at least one training episode, got none; generate some first")
         stored = self._digest(len(frame_counts)) or ""
         if digest not in ("", stored):
             raise ConfigError(
-                f"data set must still hold the shards that epoch {epoch} began with, in the order they were published "
-                "in, got others or another order; restore them or training.more_data, or start another run"
+                f"data set must still contain the shards that epoch {epoch} began with, in the order of publication, "
+                "got others or another order; restore them or training.more_data, or start another run"
             )
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)

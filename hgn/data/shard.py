@@ -43,5 +43,7 @@ def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
                 located.setdefault(key, {})[name] = (info.offset_data, info.size)
     # numbers in headers raise any of these, and long names in a row MemoryError
     except (tarfile.TarError, ValueError, LookupError, ArithmeticError, RecursionError, MemoryError) as error:
-        raise ConfigError(f"{path} must be a whole tar, got {error}; delete it and run the generator again") from None
+        raise ConfigError(
+            f"{path} must be a complete tar, got {error}; delete it and run the generator again"
+        ) from None
     return located

@@ -39,7 +39,7 @@ def cache_folder() -> Path:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "shards"
     except RuntimeError:
         raise ConfigError(
-            f"{CACHE_VARIABLE} must name a folder for a server's shards where there is no home folder, got none"
+            f"{CACHE_VARIABLE} must name a folder for a server's shards if there is no home folder, got none"
         ) from None
 
 
@@ -128,8 +128,7 @@ def _make_folder(folder: Path) -> None:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):
             raise
         raise ConfigError(
-            f"{CACHE_VARIABLE} must name a folder for a server's shards that can be written to, got {folder} "
-            f"({error.strerror})"
+            f"{CACHE_VARIABLE} must name a writable folder for a server's shards, got {folder} ({error.strerror})"
         ) from None
 
 
@@ -217,7 +216,7 @@ def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> No
             raise
         raise ConfigError(
             f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {folder} "
-            f"({error.strerror}); take one of this machine's own disks"
+            f"({error.strerror}); take one on a local disk"
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""Reads the files of a data set from a folder of this machine, or a URL (dataset service, file server, object store).
+"""Reads the files of a data set from a local folder, or a URL (dataset service, file server, object store).
 
 Shards of a URL are cached on this machine (`hgn.data.shard_cache`). `HGN_DATASET_TOKEN` is the token of a dataset
 service. With `HGN_DATASET_HOST` only that host (or host:port) receives it.
@@ -146,7 +146,7 @@ def _uses_proxies(url: str) -> bool:
             proxy = proxy if "://" in proxy else f"http://{proxy}"
             match, name = _PROXY.fullmatch(proxy), f"{kind if given.get(kind) else 'all'}_proxy"
             fits = match is not None and int(match[3] or 0) < 1 << 16
-            require(fits, name, "as http://host:port", proxy, "with %23 for # in a password, or set no_proxy")
+            require(fits, name, "of the form http://host:port", proxy, "with %23 for # in a password, or set no_proxy")
             os.environ[f"{kind}_proxy"] = proxy
     return True
 
@@ -190,7 +190,7 @@ def dataset_token() -> str | None:
 
 
 class _Folder(Storage):
-    """Reads a folder of this machine."""
+    """Reads a local folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -334,7 +334,7 @@ class _Remote(Storage):
             written = self._files.info(f"{self._root}/{name}")["size"]
         except (NotImplementedError, FileNotFoundError) as error:
             raise ConfigError(
-                f"{self._url} must be a place to write to, got {type(error).__name__} for {name}; check that it exists "
+                f"{self._url} must be writable, got {type(error).__name__} for {name}; check that it exists "
                 "and that its protocol supports writing"
             ) from None
         if written != expected:
@@ -386,7 +386,7 @@ def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
 
 
 def _cut(path: str, size: int, got: int) -> StorageError:
-    return StorageError(f"{path} must have {size} bytes, got {got}; it was cut: generate it again")
+    return StorageError(f"{path} must have {size} bytes, got {got}; it is truncated: generate it again")
 
 
 def _missing(path: Path | str) -> StorageError:
@@ -406,16 +406,14 @@ def _transient(error: Exception, url: str) -> str | None:
     if status in (401, 403) or isinstance(error, PermissionError):
         either = url.startswith("http://") and "http" in getproxies() and _uses_proxies(url)
         raise StorageError(
-            f"{url} must be open to this program, got refused{' by its server or the proxy of http_proxy' * either}; "
+            f"{url} must be accessible, got access refused{' by its server or the proxy of http_proxy' * either}; "
             f"set {TOKEN_VARIABLE} to the service's token (if {TOKEN_HOST_VARIABLE} is set, only that host receives "
             "it; object stores need their own credentials, the Hugging Face Hub needs HF_TOKEN)"
         ) from None
     if status == 410:
-        raise StorageError(f"{url} is damaged at its service; delete it there and run the generator again") from None
+        raise StorageError(f"{url} is damaged on its server; delete it there and run the generator again") from None
     if lasting:
-        raise StorageError(
-            f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"
-        ) from None
+        raise StorageError(f"{url} must be a file of a data set, got status {status}; check dataset.folder") from None
     packages = {kind.__module__.partition(".")[0] for kind in type(error).__mro__}
     if not isinstance(error, OSError) and not packages & _NETWORK_PACKAGES:
         return None

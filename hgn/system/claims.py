@@ -1,4 +1,4 @@
-"""Compares the content that a file claims with its size, before memory is allocated for it."""
+"""Compares the content that a file claims with the file's size, before memory is allocated for it."""
 
 import math
 import pickletools
@@ -31,7 +31,7 @@ class Claims:
         self._sum += math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self._most + 1
         if self._sum > self._most:
             raise ConfigError(
-                f"{self._file}: {name} must bring its content to at most {self._most} bytes, as the file has "
+                f"{self._file}: {name} must keep the content within {self._most} bytes, because the file has "
                 f"{self._file_bytes}, got {' x '.join(map(str, counts))[:200]} more; write or fetch the file again"
             )
 
@@ -51,7 +51,7 @@ def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*"))
         if isinstance(argument, int) and argument.bit_length() > 64:
             raise ValueError(f"an integer of {argument.bit_length()} bits")
         if operation.name in ("GLOBAL", "STACK_GLOBAL", "INST") and names.fullmatch(str(argument)) is None:
-            raise ValueError(f"{argument}, which is no part of it")
+            raise ValueError(f"{argument}, which is not a part of it")
         if "GET" in operation.name:
             stack.append(memo[int(argument or 0)])
         elif "PUT" in operation.name or operation.name == "MEMOIZE":

@@ -29,7 +29,7 @@ def temporary_target(path: Path) -> str:
 
 @contextlib.contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary name in the folder of `path`. At the end removes this file unless the caller renamed it.
+    """Yields a temporary name in the folder of `path`. Removes this file at the end unless the caller renamed it.
 
     A crash leaves only a file that ends in `.partial`. An OSError that names no file (a full disk) names `path`.
     """

@@ -45,7 +45,7 @@ class HubPlace:
         """Parses an address. Raises ConfigError with `field`."""
         match = _PATTERN.fullmatch(url)
         if match is None:
-            rule = "an address as hf://USER/NAME or hf://datasets/USER/NAME, @REVISION and /PATH may follow"
+            rule = "an address of the form hf://[datasets/]USER/NAME[@REVISION][/PATH]"
             raise ConfigError(f"{field} must be {rule}, got {url!r}")
         return HubPlace(match[2], match[3] or "main", (match[4] or "").strip("/"), match[1] is not None)
 
@@ -77,7 +77,7 @@ def is_loopback(url: str) -> bool:
 
 def refused_by_proxy(name: str, answer: object) -> str:
     """Returns the message for an answer of a proxy instead of the server."""
-    rule = "open to the proxy of http_proxy or https_proxy"
+    rule = "accessible through the proxy of http_proxy or https_proxy"
     return f"{name} must be {rule}, got its answer {answer}; give it the user and password it needs, or set no_proxy"
 
 
@@ -90,7 +90,7 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
     place = HubPlace.parse(url, field)
     import huggingface_hub  # slow to import, and optional
 
-    require(not place.is_dataset, field, "of a repository of weights, hf://USER/NAME", url)
+    require(not place.is_dataset, field, "the address of a repository of weights, hf://USER/NAME", url)
     direct, host = getproxies().get("no", ""), urlsplit(endpoint()).hostname
     if is_loopback(endpoint()) and host not in direct.split(","):
         os.environ["no_proxy"] = f"{direct},{host}".lstrip(",")
@@ -98,7 +98,7 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
         huggingface_hub.get_session()
     except Exception as error:  # of httpx, of several kinds
         raise ConfigError(
-            f"proxies of the environment must be as http://host:port, got {error}; or set no_proxy"
+            f"proxies of the environment must be of the form http://host:port, got {error}; or set no_proxy"
         ) from error
     api = huggingface_hub.HfApi(endpoint=endpoint(), token=hub_token())
     name = place.path
@@ -134,8 +134,8 @@ def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) ->
         return patiently(answered, lambda error: _passing(error, url, field), url, endpoint(), patience_s)
     except UnreachableError as error:
         raise ConfigError(
-            f"{field} must be within reach, got no answer from {endpoint()} for {url} in {patience_s:.0f} s "
-            f"(at last: {error.cause})"
+            f"{field} must be reachable, got no answer from {endpoint()} for {url} in {patience_s:.0f} s "
+            f"(last cause: {error.cause})"
         ) from error
 
 
@@ -148,8 +148,8 @@ def _passing(error: Exception, url: str, field: str) -> str | None:
         raise ConfigError(refused_by_proxy(field, f"{status or error} for {url}")) from None
     refused = isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403)
     if refused:
-        remedy = "check the name; a private one needs a token in HF_TOKEN"
-        raise ConfigError(f"{field} must be open to this program, got {url} refused or not there; {remedy}") from None
+        remedy = "check the name; a private repository needs a token in HF_TOKEN"
+        raise ConfigError(f"{field} must be accessible, got {url} refused or not found; {remedy}") from None
     missing = isinstance(error, errors.EntryNotFoundError) and not isinstance(error, errors.LocalEntryNotFoundError)
     if missing or (isinstance(status, int) and 400 <= status < 500 and status not in _PASSING):
         raise ConfigError(f"{field} must be a file of the repository, got {url}, which has no such file") from None

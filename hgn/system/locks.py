@@ -64,7 +64,7 @@ _again: dict[Path, Callable[[], None]] = {}  # for each folder that `locked` loc
 
 
 def make_again(folder: Path) -> None:
-    """Makes a folder if somebody has deleted it, and locks it again if this process had locked it.
+    """Creates a folder if it was deleted, and locks it again if this process had locked it.
 
     Raises ConfigError as `locked` if another process has locked a folder of this name since.
     """

@@ -29,11 +29,11 @@ class UnreachableError(OSError):
 
     def __init__(self, url: str, patience_s: float, cause: str) -> None:
         self.cause = cause
-        super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (at last: {cause})", url)
+        super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (last cause: {cause})", url)
 
 
 def standard_patience_s() -> float:
-    """Returns the seconds for which storage may be away. Raises ConfigError for a variable that is not a number."""
+    """Returns how long storage may be unreachable, in seconds. Raises ConfigError unless the variable is a number."""
     given = os.environ.get(VARIABLE, "120")
     number = float(given) if given.replace(".", "", 1).isdecimal() else math.nan
     require(0 <= number <= 1e6, VARIABLE, "a number of seconds from 0 to 1000000", given)

@@ -24,7 +24,7 @@ class _Lines:
 
 
 def duration(seconds: float) -> str:
-    """Returns a time as people say it: 40 seconds, 3.5 hours, 61 days."""
+    """Returns a duration as text: 40 seconds, 3.5 hours, 61 days."""
     size, unit = next(each for each in _UNITS if seconds >= 1.5 * each[0] or each[0] == 1)
     return f"{seconds / size:.2g} {unit}" if seconds < 100 * size else f"{seconds / size:.0f} {unit}"
 
@@ -42,7 +42,7 @@ def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqd
 
 
 def advance_to(progress: tqdm[Any], count: int) -> None:
-    """Sets the count of a bar. The first items include compilation, so the rate begins after them."""
+    """Sets the count of a bar. The rate excludes the first items, because they include compilation."""
     if count > progress.initial == progress.n:
         progress.unpause()
     # by assignment, because `update` cannot lower the count

@@ -73,12 +73,12 @@ def command_line() -> str:
 
 
 def without_folders(value: Any) -> Any:
-    """Reduces each absolute path in the texts of plain containers to its last part."""
+    """Reduces each absolute path in the strings of plain containers to its last part."""
     return with_texts(value, functools.partial(_ABSOLUTE_PATH.sub, r"\1"))
 
 
 def with_texts(value: Any, change: Callable[[str], str]) -> Any:
-    """Applies a function, `printable` for example, to the texts of plain containers."""
+    """Applies a function, `printable` for example, to the strings of plain containers."""
     if isinstance(value, str):
         return change(value)
     if isinstance(value, dict):

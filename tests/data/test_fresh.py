@@ -46,7 +46,7 @@ def test_what_reports_say_of_a_set(weights, tmp_path):
     with pytest.raises(ConfigError, match=r"fresh\.json: seed must be the data set's own"):
         set_record(folder, fresh.seed + 1, [weights])
     (folder / "fresh.json").write_text(json.dumps({"seed": "x"}))
-    message = r"fresh\.json must be what python -m datagen frozen=… wrote, got .*seed must be"
+    message = r"fresh\.json must be a file that python -m datagen frozen=… wrote, got .*seed must be"
     with pytest.raises(ConfigError, match=message):
         read_fresh(folder)
 
@@ -54,11 +54,11 @@ def test_what_reports_say_of_a_set(weights, tmp_path):
 def test_what_is_no_fresh_set_is_refused(weights, tmp_path, folder):
     """A data set that is there, weights that changed since, files that are not there."""
     assert Manifest.load(folder).complete
-    with pytest.raises(ConfigError, match=r"frozen must be left out: .* holds a data set whose seed was chosen before"):
+    with pytest.raises(ConfigError, match=r"frozen must be left out, because the seed of .* was not drawn"):
         draw_fresh(folder, [str(weights)])
     draw_fresh(tmp_path / "fresh", [str(weights)])
     weights.write_bytes(b"changed")
-    with pytest.raises(ConfigError, match="weights that changed need another folder"):
+    with pytest.raises(ConfigError, match="changed weights need another folder"):
         draw_fresh(tmp_path / "fresh", [str(weights)])
     with pytest.raises(ConfigError, match=r"frozen\[0\] must be an existing file of weights, got 'none'"):
         draw_fresh(tmp_path / "fresh", ["none"])

@@ -74,7 +74,7 @@ def test_interim_answers_are_bounded(monkeypatch, status, count):
             assert open_storage(url).manifest("manifest.json") == b"{}"
         else:
             monkeypatch.setattr("hgn.data.bounded_http.HEAD_S", 5.0)
-            with pytest.raises(UnreachableError, match=r"\(at last: it sent more than 100 interim answers\)"):
+            with pytest.raises(UnreachableError, match=r"\(last cause: it sent more than 100 interim answers\)"):
                 open_storage(url).manifest("manifest.json")
 
 
@@ -102,7 +102,7 @@ def test_answers_are_bounded(monkeypatch, attack):
             assert len(storage.manifest("manifest.json")) < 20_000
         else:
             limit = 50 if attack == "long range" else 100_000
-            with pytest.raises(ConfigError, match=f"must answer with at most {limit} bytes, got more"):
+            with pytest.raises(ConfigError, match=f"must send at most {limit} bytes, got more"):
                 storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
 
 
@@ -151,22 +151,25 @@ def test_proxies_are_honoured(monkeypatch, variable):
     monkeypatch.delenv("http_proxy")
     for proxy in ("socks5://127.0.0.1:1", "http://me:a#b@127.0.0.1:1", "http://me:a/b@127.0.0.1:1", "127.0.0.1:99999"):
         monkeypatch.setenv(variable, proxy)
-        with pytest.raises(ConfigError, match=f"{variable.lower()} must be as http://host:port, got "):
+        with pytest.raises(ConfigError, match=f"{variable.lower()} must be of the form http://host:port, got "):
             hgn.data.storage._uses_proxies("http://11.0.0.1/set")
 
 
 @pytest.mark.parametrize(
     ("scheme", "status", "message"),
     [
-        ("http", 407, "open to the proxy of http_proxy or https_proxy, got its answer 407"),
-        ("https", 407, "open to the proxy of http_proxy or https_proxy, got its answer 407"),
-        *(("https", status, f"open to the proxy of .*, got its answer {status}") for status in (401, 403, 404, 410)),
+        ("http", 407, "accessible through the proxy of http_proxy or https_proxy, got its answer 407"),
+        ("https", 407, "accessible through the proxy of http_proxy or https_proxy, got its answer 407"),
+        *(
+            ("https", status, f"accessible through the proxy of .*, got its answer {status}")
+            for status in (401, 403, 404, 410)
+        ),
         (
             "http",
             403,
-            "open to this program, got refused by its server or the proxy of http_proxy; set HGN_DATASET_TOKEN",
+            "accessible, got access refused by its server or the proxy of http_proxy; set HGN_DATASET_TOKEN",
         ),
-        ("https", 429, "no answer for 0 s .at last: 429"),
+        ("https", 429, "no answer for 0 s .last cause: 429"),
     ],
 )
 def test_proxies_that_refuse_are_named(monkeypatch, scheme, status, message):

@@ -80,7 +80,9 @@ def test_proxies_that_refuse_are_named(hub, monkeypatch, scheme, status):
         monkeypatch.setenv("HF_ENDPOINT", f"{scheme}://data.example")
         monkeypatch.setenv(f"{scheme}_proxy", address)
         huggingface_hub.close_session()
-        with pytest.raises(ConfigError, match=f"weights must be open to the proxy of .*, got its answer .*{status}"):
+        with pytest.raises(
+            ConfigError, match=f"weights must be accessible through the proxy of .*, got its answer .*{status}"
+        ):
             hub_weights("hf://one/net")
     huggingface_hub.close_session()
 
@@ -88,13 +90,13 @@ def test_proxies_that_refuse_are_named(hub, monkeypatch, scheme, status):
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("hf://one", r"weights must be an address as hf://USER/NAME .* got 'hf://one'"),
-        ("hf://datasets/one/data", r"weights must be of a repository of weights, hf://USER/NAME"),
+        ("hf://one", r"weights must be an address of the form hf://.* got 'hf://one'"),
+        ("hf://datasets/one/data", r"weights must be the address of a repository of weights, hf://USER/NAME"),
         ("hf://one/two", r"weights must name one of a.safetensors, b.safetensors, got 'hf://one/two'"),
         ("hf://one/none", r"weights must name a repository with a .safetensors file"),
-        ("hf://one/absent", r"weights must be open to this program, got hf://one/absent refused or .*HF_TOKEN"),
+        ("hf://one/absent", r"weights must be accessible, got hf://one/absent refused or .*HF_TOKEN"),
         ("hf://one/net/other.safetensors", r"weights must be a file of the repository, got .*has no such file"),
-        ("hf://one/private/x.safetensors", r"weights must be open to this program"),
+        ("hf://one/private/x.safetensors", r"weights must be accessible"),
     ],
 )
 def test_what_cannot_be_had_is_told(url, message, hub):
@@ -112,7 +114,7 @@ def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
         hub.failures = 2
         assert find_weights(name).is_file()
     hub.failures = 1_000_000
-    with pytest.raises(ConfigError, match=r"weights must be within reach, got no answer from .* for hf://one/two/a"):
+    with pytest.raises(ConfigError, match=r"weights must be reachable, got no answer from .* for hf://one/two/a"):
         hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
 
 
@@ -121,7 +123,7 @@ def test_a_repository_that_answers_too_slowly(hub, monkeypatch):
     answer = hub_server._Handler._answer
     monkeypatch.setattr(hub_server._Handler, "_answer", lambda *given: time.sleep(0.5) or answer(*given))
     monkeypatch.setattr("hgn.system.hub._DOWNLOAD_S", 0.1)
-    with pytest.raises(ConfigError, match=r"weights must be within reach.*TimeoutError"):
+    with pytest.raises(ConfigError, match=r"weights must be reachable.*TimeoutError"):
         hub_weights("hf://one/two/b.safetensors", patience_s=0.0)
 
 
@@ -137,7 +139,7 @@ def test_a_data_set_is_read_from_a_repository(hub, folder, monkeypatch):
         for left, right in zip(remote, local, strict=True):
             assert np.array_equal(left.position_TN3, right.position_TN3)
     assert not EpisodeStore.available("hf://datasets/one/nothing")
-    with pytest.raises(ConfigError, match=r"dataset.folder must be an address as hf://USER"):
+    with pytest.raises(ConfigError, match=r"dataset.folder must be an address of the form hf://"):
         EpisodeStore("hf://data", "train")
 
 

@@ -109,7 +109,7 @@ def test_gravity_is_estimated_from_what_flies(gravity):
     path[:, 50:] += 1e-4 * generator.normal(size=(120, 10, axes))
     found = estimate_gravity([path.astype(np.float32)], dt)
     assert found == pytest.approx(gravity, abs=0.005 * float(np.linalg.norm(gravity)))
-    with pytest.raises(ConfigError, match=r"gravity must be given where fewer than 20 particles fall, got 0; give it"):
+    with pytest.raises(ConfigError, match=r"gravity must be given if fewer than 20 particles fall freely, got 0; give"):
         estimate_gravity([path[:, 40:].astype(np.float32)], dt)
 
 
@@ -150,13 +150,13 @@ def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
 
     assert imported("kept", walk, slight) == []
     (line,) = imported("left", slight, risen, fallen)
-    assert line.startswith("bounds: particles of 2 of 3 trajectories go farther out of them than a radius (0.035)")
-    assert "train.npz: 00002 to y = -0.25 in frame 6, where bounds are [0.0, 1.0]" in line
+    assert line.startswith("bounds: particles of 2 of 3 trajectories leave them by more than a radius (0.035)")
+    assert "to y = -0.25 in frame 6 of " in line and "train.npz: 00002 with bounds [0.0, 1.0];" in line
     assert line.endswith("give bounds=… around all particles, or leave these trajectories out")
     archive = tmp_path / "of_left" / "train.npz"  # names that the file's author chose
     np.savez(archive, **{name.replace("00002/", "\x1b[31m/"): array for name, array in np.load(archive).items()})
     assert import_trajectories.main(options(tmp_path / "named", archive.parent)) == 0
-    assert "train.npz: \\x1b[31m to y = -0.25" in capsys.readouterr().err
+    assert "train.npz: \\x1b[31m with bounds" in capsys.readouterr().err
 
 
 def test_a_folder_without_trajectories(tmp_path, capsys):
@@ -192,7 +192,7 @@ def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
     assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train")] == own
     if one_each:
         tell(2.0)
-        message = r"sim_0.h5: gravity must be that of particles in free flight, .* got \[0.0, -1.0,"
+        message = r"sim_0.h5: gravity must agree with free flight, .* got \[0.0, -1.0,"
         with pytest.raises(ConfigError, match=message):
             import_trajectories.main(options(tmp_path / "other", source, gravity=None))
 

@@ -150,7 +150,7 @@ def test_a_list_that_is_written_anew_again(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("pattern", "text", "message"),
     [
-        (r'"sha256":"....', '"sha256":"0000', "must hold the .* shards that were published, got others"),
+        (r'"sha256":"....', '"sha256":"0000', "must list the .* shards that were published, got others"),
         (r"^.*\n", "", "must have [0-9]+ bytes, got"),
         (r"\Z", "{}\n", ""),
         (r"}\n", " \n", "must be JSON"),

@@ -52,7 +52,7 @@ def test_identity(make_config):
     assert identity_hash(reread) == identity_hash(identity) and identity_differences(reread, identity) == []
     lines = identity_differences({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 1, "c": 4}, "e": 5})
     differences = ["a.c is 2 there, 4", "d is 3 there, nothing", "e is nothing there, 5"]
-    assert lines == [f"{difference} is asked for" for difference in differences]
+    assert lines == [f"{difference} is requested" for difference in differences]
 
 
 def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeypatch):

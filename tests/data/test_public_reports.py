@@ -70,7 +70,7 @@ def test_coarse_positions(offset, stored, radius):
     position_TND = (POSITIONS[0].astype(np.float64) * radius + offset).astype(np.float32).astype(stored)
     coarse = np.spacing(np.float32(offset + radius)) > 1e-3 * radius
     if coarse:
-        with pytest.raises(ConfigError, match=r"set: position must have numbers at most .* of float32 at"):
+        with pytest.raises(ConfigError, match=r"set: position must have a resolution of .* in float32 at"):
             require_fine("set", position_TND, radius)
     else:
         require_fine("set", position_TND, radius)
@@ -96,7 +96,7 @@ def test_positions_rounded_before(name, stored):
     """Numbers that were rounded, and then stored in a finer type, are as coarse as before; a lattice is not."""
     walk_TN3 = RNG.random((1, 60, 3), np.float32) + np.cumsum(0.01 * RNG.random((20, 60, 3), np.float32), 0)
     require_fine("set", walk_TN3.astype(stored), 0.035)
-    with pytest.raises(ConfigError, match=r"set: position must have numbers at most 3.5e-05 apart"):
+    with pytest.raises(ConfigError, match=r"set: position must have a resolution of 3.5e-05 .* or finer"):
         require_fine("set", ROUNDED[name](walk_TN3).astype(stored), 0.035)
     require_fine("set", np.tile((np.arange(180.0) % 17 / 16).reshape(60, 3).astype(stored), (20, 1, 1)), 0.035)
 

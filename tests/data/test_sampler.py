@@ -136,9 +136,9 @@ def test_what_cannot_be_resumed():
         (8, 20, 0, SamplerState(1, 0, 20, "", 8), digest, None),
         (8, 20, 8, own, digest, r"training\.seed must be 7 to resume in the middle of epoch 0, got 8"),
         (7, 20, 0, own, digest, r"training\.shuffle_episodes must be 8 to resume in the middle of epoch 0"),
-        (7, 20, 8, own, lambda _: "other", "must still hold the shards that epoch 0 began with"),
-        (7, 20, 8, own, lambda _: None, "must still hold the shards that epoch 0 began with"),
-        (7, 2, 0, SamplerState(0, 2, 3, seed=7), digest, "must still hold the 3 training episodes"),
+        (7, 20, 8, own, lambda _: "other", "must still contain the shards that epoch 0 began with"),
+        (7, 20, 8, own, lambda _: None, "must still contain the shards that epoch 0 began with"),
+        (7, 2, 0, SamplerState(0, 2, 3, seed=7), digest, "must still contain the 3 training episodes"),
         (7, 0, 0, None, digest, "at least one training episode"),
     ):
         begin = partial(EpisodeSampler, seed, 1, lambda _, n=scenes: [5] * n, state, window=window, digest=found)

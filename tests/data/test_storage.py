@@ -198,7 +198,7 @@ def test_altered_or_cut_shards_are_refused(folder, cache):
     store = EpisodeStore(url, "train")
     with pytest.raises(ConfigError, match=r"memory://altered/train-.*\.tar must have sha256 [0-9a-f]{64}, got other"):
         store[0]
-    with pytest.raises(ConfigError, match=rf"must have {second.bytes} bytes, got {second.bytes // 2}; it was cut"):
+    with pytest.raises(ConfigError, match=rf"must have {second.bytes} bytes, got {second.bytes // 2}; it is truncated"):
         store[1]
     files.rm(f"/altered/{second.name}")
     with pytest.raises(ConfigError, match="is listed in the index but missing"):
@@ -287,7 +287,7 @@ def test_token(folder, serve, monkeypatch):
         if token:
             monkeypatch.setenv(TOKEN_VARIABLE, token)
         hgn.data.storage._remote.cache_clear()
-        with pytest.raises(ConfigError, match="must be open to this program, got refused; set HGN_DATASET_TOKEN"):
+        with pytest.raises(ConfigError, match="must be accessible, got access refused; set HGN_DATASET_TOKEN"):
             EpisodeStore(url, "train")
     monkeypatch.setenv(TOKEN_VARIABLE, TOKEN)
     hgn.data.storage._remote.cache_clear()
@@ -310,7 +310,7 @@ def test_command_without_its_server(monkeypatch, capsys):
     url = f"http://127.0.0.1:{free_port()}"
     assert exit_code(lambda _: Manifest.load(url, patience_s=0.01), "datagen", [], monkeypatch) == 1
     error = capsys.readouterr().err
-    assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
+    assert error.startswith("error: no answer for 0 s (last cause: ") and error.count("\n") == 1
     assert error.endswith(f"{url}/manifest.json; check its server or disk and run the same command again\n")
 
 
@@ -353,7 +353,7 @@ FAULTS = [  # of the cache: a call that fails and its error, or what lies in the
     ((os, "fsync", errno.ENOSPC), OSError, "No space left on device: .*cache/shards"),
     ((fcntl, "flock", errno.ENOSYS), ConfigError, FILE_SYSTEM),  # as on Lustre without -o flock
     ("a link", ConfigError, "must be a file, got a link"),
-    ("a file", ConfigError, rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"),
+    ("a file", ConfigError, rf"{CACHE_VARIABLE} must name a writable folder .* got .*shards \(Not a directory\)"),
 ]
 
 
@@ -388,7 +388,7 @@ def test_damage_at_the_service(folder, serve):
     store = EpisodeStore(serve(), "train")
     shard = folder / store.manifest.shards[0].name
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
-    with pytest.raises(ConfigError, match=r"train-000000-000001.tar is damaged at its service; delete it there and"):
+    with pytest.raises(ConfigError, match=r"train-000000-000001.tar is damaged on its server; delete it there and"):
         store[0]
 
 

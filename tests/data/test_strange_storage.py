@@ -342,7 +342,7 @@ def test_numbers_that_no_network_can_compute_with_are_named(data, tmp_path, spli
     """A training on them ends with an error that names the shard and the frame, instead of skipping updates."""
     name, rule = with_value(data.dataset.folder, split, value, member), "at most 1000 in size"
     rule = f"{member[:8]} must be {rule if abs(value) < np.inf else 'finite'}, got"
-    with pytest.raises(ConfigError, match=f"{name} must be a sound shard, got {split}-.*: {rule}"):
+    with pytest.raises(ConfigError, match=f"{name} must be a valid shard, got {split}-.*: {rule}"):
         train.main(train_mapping(data, tmp_path / "run"))
 
 

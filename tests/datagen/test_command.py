@@ -136,7 +136,7 @@ def test_makes_completes_and_leaves_alone(command, tmp_path):
     assert (tmp_path / "made" / "manifest.json").read_bytes() == manifest
     assert [path.name for path in tmp_path.iterdir() if path.name != "control"] == ["made"]
     code, _, errors = command(*SMALL, "out=made", "scene=no_obstacles")
-    assert code == 2 and errors.startswith("error: made holds another data set: scene.group_shapes is")
+    assert code == 2 and errors.startswith("error: made contains another data set: scene.group_shapes is")
 
 
 def test_resolved_config_file(command, make_config, tmp_path):

@@ -326,7 +326,7 @@ def test_what_cannot_be_served(monkeypatch, capsys, tmp_path, folder):
     (tmp_path / "made" / "train-000000-000001.tar").write_bytes(b"no tar")
     monkeypatch.delenv(TOKEN_VARIABLE)
     assert run_service(["out=made", "port=0", "progress=off"], monkeypatch) == 2
-    assert "train-000000-000001.tar must be a whole tar" in capsys.readouterr().err
+    assert "train-000000-000001.tar must be a complete tar" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")

@@ -100,11 +100,11 @@ def test_what_is_complete(make_config, make_dataset, folder, stage, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scene": SceneConfig(obstacle_count=3)}, "scene.obstacle_count is 5 there, 3 is asked for"),
-        ({"mpm": MpmConfig(snow_hardening=5.0)}, "mpm.snow_hardening is 10.0 there, 5.0 is asked for"),
-        ({"seed": 1}, "seed is 0 there, 1 is asked for"),
-        ({"frames": 7}, "frames is 6 there, 7 is asked for"),
-        ({"frame_rate_hz": 30.0}, "frame_rate_hz is 60.0 there, 30.0 is asked for"),
+        ({"scene": SceneConfig(obstacle_count=3)}, "scene.obstacle_count is 5 there, 3 is requested"),
+        ({"mpm": MpmConfig(snow_hardening=5.0)}, "mpm.snow_hardening is 10.0 there, 5.0 is requested"),
+        ({"seed": 1}, "seed is 0 there, 1 is requested"),
+        ({"frames": 7}, "frames is 6 there, 7 is requested"),
+        ({"frame_rate_hz": 30.0}, "frame_rate_hz is 60.0 there, 30.0 is requested"),
     ],
 )
 def test_other_settings_are_refused(make_config, folder, changes, message):
@@ -112,7 +112,7 @@ def test_other_settings_are_refused(make_config, folder, changes, message):
     parts = {name: changes[name] for name in ("scene", "mpm") if name in changes}
     config = dataclasses.replace(make_config(**({} if parts else changes)), **parts)
     before = snapshot(folder)
-    with pytest.raises(ConfigError, match=f"holds another data set: {message}; choose another folder"):
+    with pytest.raises(ConfigError, match=f"contains another data set: {message}; choose another folder"):
         DatasetWriter(config).__enter__()
     assert snapshot(folder) == before
 

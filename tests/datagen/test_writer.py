@@ -88,7 +88,7 @@ def test_pipe_in_the_place_of_a_shard(make_config, tmp_path):
     folder = tmp_path / "piped"
     folder.mkdir()
     os.mkfifo(folder / "train-000000-000001.tar")
-    with pytest.raises(ConfigError, match="must be a whole tar"), DatasetWriter(make_config(folder=str(folder))):
+    with pytest.raises(ConfigError, match="must be a complete tar"), DatasetWriter(make_config(folder=str(folder))):
         pass
 
 

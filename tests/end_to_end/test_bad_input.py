@@ -46,7 +46,7 @@ VALUES = [
     ("service", ["host=no.such.host.invalid"], "host and port must be available, got no.such.host.invalid:8000"),
     ("service", ["host=no..host"], "host and port must be available, got no..host:8000 ("),
     ("service", ["out=http://localhost:1"], "out must be a folder to write to, got 'http://localhost:1'"),
-    ("service", ["out=data", "port=0", "dataset.seed=7"], "holds another data set: frames is 6 there"),
+    ("service", ["out=data", "port=0", "dataset.seed=7"], "contains another data set: frames is 6 there"),
     ("solve", ["scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
     ("solve", ["scene=scene.yaml", "mpm.snow_hardning=5"], "mpm.snow_hardning is not a known key; did you mean snow_h"),
     ("upload", ["data=data", "to=data"], "to must be a URL, got"),
@@ -96,7 +96,7 @@ VALUES = [
     ("evaluate", [*EVALUATE, "data=hf://dataset/a/b"], "must be of a repository of data sets, hf://datasets/USER/NAME"),
     ("evaluate", [*EVALUATE, "data=htpp://host/a"], "(Protocol not known: htpp); did you mean http?"),
     *(
-        ("rollout", [*ROLLOUT, f"weights={name}"], "weights must be an address as hf://USER/NAME or hf://datasets/USER")
+        ("rollout", [*ROLLOUT, f"weights={name}"], "weights must be an address of the form hf://")
         for name in ("hf:/a/b", "hf:a/b", "hf//a/b", "hff://a/b")
     ),
     ("rollout", [*ROLLOUT, "weights=weight.safetensors"], "got weight.safetensors; did you mean weights.safetensors?"),
@@ -142,7 +142,7 @@ VALUES = [
     # a run is not resumed under another network, noise or data set
     ("train", ["network.width=16"], "network.width must be 8 to resume"),
     ("train", ["training.noise_std=0.01"], "training.noise_std must be 0.000848528 to resume"),
-    ("train", ["dataset.frames=7"], "holds another data set: frames is 6 there, 7 is asked for"),
+    ("train", ["dataset.frames=7"], "contains another data set: frames is 6 there, 7 is requested"),
 ]
 
 

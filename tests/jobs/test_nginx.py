@@ -80,7 +80,7 @@ def test_a_data_set_that_grows(make_config, make_dataset, address, tmp_path):
     wait_until(lambda: ask().startswith("5 "))
     process.communicate()
     refused = reader(address, tmp_path, **{TOKEN_HOST_VARIABLE: "elsewhere:443"})
-    assert "must be open to this program, got refused" in refused.communicate("\n", timeout=PATIENCE_S)[1]
+    assert "must be accessible, got access refused" in refused.communicate("\n", timeout=PATIENCE_S)[1]
     waiting = reader(address, tmp_path, SSL_CERT_FILE="")
     assert waiting.stderr is not None
     try:

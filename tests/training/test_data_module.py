@@ -74,7 +74,7 @@ def test_shard_made_again_is_not_mixed_up(make_config, make_dataset, folder):
     make_dataset(make_config())
     again = windows_of(folder)
     again.sampler_state = last.sampler_state
-    with pytest.raises(ConfigError, match="must still hold the shards that epoch 0 began with, in the order"):
+    with pytest.raises(ConfigError, match="must still contain the shards that epoch 0 began with, in the order"):
         next(again.chunks())
 
 

@@ -143,7 +143,7 @@ def test_more_data(data, other, run):
     mean = merge_statistics(store.statistics() for store in stores).velocity.mean
     stored = read_checkpoint(run / "checkpoints" / "last.ckpt")["state_dict"]
     assert stored["network.normaliser.velocity_mean"].tolist() == pytest.approx(mean)
-    with pytest.raises(ConfigError, match="data set must still hold the 8 training episodes"):
+    with pytest.raises(ConfigError, match="data set must still contain the 8 training episodes"):
         train.main(train_mapping(data, run))
     assert train.main(train_mapping(data, run, **more)) == 0
     network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)

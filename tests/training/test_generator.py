@@ -62,7 +62,7 @@ def test_makes_what_is_missing(tmp_path):
 
     other = Generator(replace(config, mpm=replace(config.mpm, poisson_ratio=0.3)), tmp_path / "other")
     wait(other)
-    with pytest.raises(ConfigError, match=r"holds another data set: mpm.poisson_ratio .*log: .*datagen.log"):
+    with pytest.raises(ConfigError, match=r"contains another data set: mpm.poisson_ratio .*log: .*datagen.log"):
         other.check()
 
 

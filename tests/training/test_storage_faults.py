@@ -127,11 +127,11 @@ def test_a_manifest_that_is_away_for_a_moment(data, name, capsys, monkeypatch):
         with faulty(data.dataset.folder, name):
             assert not store.refresh() and len(store) == 5
             store.ask_again()
-            assert capsys.readouterr().err.count("going on with") == 1
+            assert capsys.readouterr().err.count("continuing with") == 1
         store.ask_again()
         with faulty(data.dataset.folder, name):
             assert not store.refresh()
-            assert "going on with 5 episodes for 120 s" in capsys.readouterr().err
+            assert "continuing with 5 episodes for 120 s" in capsys.readouterr().err
             monkeypatch.setenv(VARIABLE, "0")
             with pytest.raises((ConfigError, OSError)) as error:
                 store.ask_again()

@@ -1,1 +1,1 @@
-"""Import of trajectories of other programs; no code of theirs is run, no pickle is loaded."""
+"""Imports trajectories of other programs without running their code or loading pickles."""

@@ -38,7 +38,7 @@ def import_set(
     Raises: ConfigError naming the file and field that cannot be read; OSError.
     """
     out = Path(config.out)
-    require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this holds a data set")
+    require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this one contains a data set")
     info = set_info(source, find_format(source, config.format), config)
     first = list(itertools.islice(read_split(source, "train", info), LOOKED_AT))
     require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
@@ -83,7 +83,7 @@ def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
     without = [trajectory for trajectory in first if trajectory.gravity is None]
     if without:
         return _estimated(without, info)
-    for trajectory in first if info.format == "neuralmpm" else ():  # neuralmpm does not document its units
+    for trajectory in first if info.format == "neuralmpm" else ():  # the units of neuralmpm are not documented
         stored_3 = np.array(trajectory.gravity)
         try:
             estimated_3 = np.array(_estimated([trajectory], info))
@@ -91,8 +91,8 @@ def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
             continue
         if np.linalg.norm(estimated_3 - stored_3) > 0.1 * np.linalg.norm(stored_3):
             raise ConfigError(
-                f"{trajectory.name}: gravity must be that of particles in free flight, length per second squared, got "
-                f"{stored_3.tolist()} where they show {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
+                f"{trajectory.name}: gravity must agree with free flight, in length per second squared, got "
+                f"{stored_3.tolist()} instead of {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
             )
     assert first[0].gravity is not None
     return first[0].gravity
@@ -104,8 +104,8 @@ def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
     size = float(np.linalg.norm(gravity))
     if info.gravity_size is not None and abs(size - info.gravity_size) > 0.1 * info.gravity_size:
         raise ConfigError(
-            f"gravity must be given where particles in free flight contradict metadata.json's g_ext_magnitude of "
-            f"{info.gravity_size:g}, got {size:.3g}; as in gravity=[0,-{info.gravity_size:g}]"
+            f"gravity must be given if particles in free flight contradict metadata.json's g_ext_magnitude of "
+            f"{info.gravity_size:g}, got {size:.3g}; for example gravity=[0,-{info.gravity_size:g}]"
         )
     return gravity
 

@@ -59,19 +59,17 @@ class Converter:
         """
         info, name = self.info, trajectory.name
         frames, first = len(trajectory.position_TND), self.history
-        require(frames >= first + 2, f"{name}: position", f"{first} + 2 frames or more, for history={first}", frames)
+        require(frames >= first + 2, f"{name}: position", f"of at least {first} + 2 frames for history={first}", frames)
         fixed_N = np.isin(trajectory.type_N, list(info.boundary_types))
-        require(
-            not fixed_N.all(), f"{name}: position", "of particles that are no obstacles, too", "none", "leave it out"
-        )
+        require(not fixed_N.all(), f"{name}: position", "of particles that are not obstacles", "none", "leave it out")
         require_fine(name, trajectory.position_TND, info.radius)
         position_TN3 = self._placed(trajectory.position_TND)
         still_TP3, free_TN3 = position_TN3[:, fixed_N], position_TN3[:, ~fixed_N]
         moved = float(np.abs(still_TP3 - still_TP3[:1]).max(initial=0))
         if moved > AT_REST * info.radius:
             raise ConfigError(
-                f"{name}: particles of types {sorted(info.boundary_types)} must be at rest, got a motion by "
-                f"{moved:.3g}: networks know obstacles at rest; say which types are obstacles with boundary_types=[...]"
+                f"{name}: particles of types {sorted(info.boundary_types)} must be at rest, got a displacement of "
+                f"{moved:.3g}: imported obstacles cannot move; set the types of obstacles with boundary_types=[...]"
             )
         self._require_inside(name, free_TN3[0])
         self._require_not_across(name, free_TN3)
@@ -83,7 +81,7 @@ class Converter:
         grid = self._grid(trajectory, boundary_P3)
         gravity = trajectory.gravity or self.gravity
         most = max(self.domain_size) / info.frame_dt_s**2
-        rule, largest = f"at most {most:.3g}, the box in a frame", max(map(abs, (*gravity, *self.gravity)))
+        rule, largest = f"at most {most:.3g}, one box per frame", max(map(abs, (*gravity, *self.gravity)))
         require(largest <= most, f"{name}: gravity", rule, largest, "check dt")
         x, y, z = (*gravity, 0.0)[:3]
         # the velocity at frame 0 of a free flight from frame -1
@@ -140,12 +138,12 @@ class Converter:
             corners = (place_N3.min(0), place_N3.max(0))
             extent = [[round(float(c[axis]), 4) for c in corners] for axis in range(self.info.dimensions)]
             raise ConfigError(
-                f"bounds must hold the particles, got {[list(pair) for pair in self.info.bounds]} with {outside:.0%} "
-                f"of those of {name} outside, which lie in {extent}; give bounds=…"
+                f"bounds must contain the particles, got {[list(pair) for pair in self.info.bounds]} with "
+                f"{outside:.0%} of {name} outside, whose particles are in {extent}; give bounds=…"
             )
 
     def _note_outside(self, name: str, position_TND: np.ndarray) -> None:
-        """Records a trajectory that leaves its bounds. One splash over an edge is no reason to refuse a set."""
+        """Records a trajectory that leaves its bounds. A set is not refused for one splash over an edge."""
         low_D, high_D = np.array(self.info.bounds).T
         excess_2D = np.stack([low_D - position_TND.min((0, 1)), position_TND.max((0, 1)) - high_D])
         above, axis = (int(index) for index in np.unravel_index(excess_2D.argmax(), excess_2D.shape))
@@ -153,8 +151,8 @@ class Converter:
         if excess > self.info.radius:
             place = int(path_TN.argmax() if above else path_TN.argmin())
             low, high = self.info.bounds[axis]
-            where = f"those of {name} to {'xyz'[axis]} = {float(path_TN.flat[place]):.4g} in frame "
-            where += f"{place // path_TN.shape[1]}, where bounds are [{low}, {high}]"
+            where = f"{'xyz'[axis]} = {float(path_TN.flat[place]):.4g} in frame {place // path_TN.shape[1]} of {name} "
+            where += f"with bounds [{low}, {high}]"
             self.outside.append((excess, where))
 
     def note_on_bounds(self, converted: int) -> str | None:
@@ -162,9 +160,9 @@ class Converter:
         if not self.outside:
             return None
         return (
-            f"bounds: particles of {len(self.outside)} of {converted} trajectories go farther out of them than a "
-            f"radius ({self.info.radius:g}), {max(self.outside)[1]}; networks take them for walls: give bounds=… "
-            "around all particles, or leave these trajectories out"
+            f"bounds: particles of {len(self.outside)} of {converted} trajectories leave them by more than a radius "
+            f"({self.info.radius:g}), for example to {max(self.outside)[1]}; networks treat bounds as walls: give "
+            "bounds=… around all particles, or leave these trajectories out"
         )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
@@ -173,9 +171,9 @@ class Converter:
             path_TN, high = free_TN3[..., axis], self.domain_size[axis]
             if periodic and path_TN.size and min(path_TN.min(), high - path_TN.max()) < self.info.radius:
                 raise ConfigError(
-                    f"metadata.json: periodic_boundary_conditions must be false on axis {'xyz'[axis]}, where particles "
-                    f"of {name} come within a radius ({self.info.radius:g}) of the box's side: cells and walls of the "
-                    "networks end at the box, and do not meet their other side"
+                    f"metadata.json: periodic_boundary_conditions must be false on axis {'xyz'[axis]}, because "
+                    f"particles of {name} come within a radius ({self.info.radius:g}) of the box's side, and networks "
+                    "do not support periodic boundaries"
                 )
 
     def _grid(self, trajectory: Trajectory, boundary_P3: np.ndarray) -> ObstacleGrid:
@@ -193,7 +191,7 @@ class Converter:
         names = self.info.materials
         unknown = sorted({int(number) for number in np.unique(type_N)} - set(names))
         if unknown:
-            remedy = f"give it one, as in materials={{{unknown[0]}: clay}}"
+            remedy = f"add one, as in materials={{{unknown[0]}: clay}}"
             raise ConfigError(f"{name}: particle_type must have a name for each number, got {unknown}; {remedy}")
         index = {number: self.materials.index(value) for number, value in names.items()}
         types, of_type_N = np.unique(type_N, return_inverse=True)
@@ -227,4 +225,4 @@ def flat_plane(radius: float, obstacle_cell: float) -> float:
         middle = 0.1 < float(z) / obstacle_cell % 1 < 0.9
         if z / cell == wanted and z * inverse == wanted and unrounded == layer and middle:
             return float(z)
-    raise ConfigError(f"radius must be one that float32 divides by, got {radius}; give radius=… with fewer digits")
+    raise ConfigError(f"radius must divide exactly in float32, got {radius}; give radius=… with fewer digits")

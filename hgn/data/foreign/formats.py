@@ -54,7 +54,7 @@ def find_format(folder: Path, required: str) -> str:
     names = "train.tfrecord, train.npz, train.h5 or train/sim_0.h5"
     require(bool(formats), "from", f"a folder with {names}", str(folder), "see docs/how_to/import.md")
     if required == "auto":
-        require(len(formats) == 1, "format", f"one of {', '.join(formats)}, which {folder} has", required)
+        require(len(formats) == 1, "format", f"one of {', '.join(formats)}, the formats in {folder}", required)
         return formats[0]
     alike = {"lagrangebench", "plain"}  # formats with the same files
     fits = required in formats or (required in alike and bool(alike & set(formats)))
@@ -72,8 +72,8 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
         raw = dict(raw["train"])
     if "context_mean" in raw:
         raise ConfigError(
-            f"{folder}/metadata.json: context_mean must be absent, got a set with step_context: no network here takes "
-            "a force that changes with time"
+            f"{folder}/metadata.json: context_mean must be absent, got a set with step_context: forces that change "
+            "with time are not supported"
         )
     types, boundary = (_LAGRANGEBENCH, [1, 2]) if name == "lagrangebench" else (_DEEPMIND, [3])
 
@@ -85,7 +85,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
     bounds = given("bounds", config.bounds, (None, 2))
     dt, radius = given("dt", config.dt, ()), given("default_connectivity_radius", config.radius, ())
     for key, value in {"bounds": bounds, "dt": dt, "radius": radius}.items():
-        rule = f"given where {folder}/metadata.json does not say it"
+        rule = f"given if {folder}/metadata.json does not contain it"
         require(value is not None, key, rule, value, f"as in {key}={_EXAMPLES[key]}")
     dimensions = given("dim", config.dimensions, (), float(len(bounds)))
     require(dimensions in (2, 3), f"{folder}/metadata.json: dim", "2 or 3", dimensions)
@@ -155,7 +155,7 @@ def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
         name = f"{path}: record {number}"
         context, lists = parse_sequence_example(record, name)
         if "step_context" in lists:
-            raise ConfigError(f"{name}: step_context must be absent, as no network takes forces that change with time")
+            raise ConfigError(f"{name}: step_context must be absent: forces that change with time are not supported")
         types = _joined(f"{name}: particle_type", context.get("particle_type"), "<i8")
         flat = _joined(f"{name}: position", lists.get("position"), "<f4")
         frames: Any = info.raw.get("sequence_length")
@@ -169,10 +169,10 @@ def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
 
 def _joined(name: str, parts: list[bytes] | None, dtype: str) -> np.ndarray:
     if not parts:
-        raise ConfigError(f"{name} is missing; the record must have it as bytes")
+        raise ConfigError(f"{name} is missing; the record must contain it as bytes")
     data = b"".join(parts)
     size = np.dtype(dtype).itemsize
-    require(len(data) % size == 0, name, f"whole numbers of {size} bytes", f"{len(data)} bytes")
+    require(len(data) % size == 0, name, f"a multiple of {size} bytes", f"{len(data)} bytes")
     return np.frombuffer(data, dtype)
 
 
@@ -210,7 +210,7 @@ def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
         return
     with _opened(path) as file:
         for key in sorted(file):
-            with damage_named(f"{path}: {key} must be whole", _AGAIN):
+            with damage_named(f"{path}: {key} must be complete", _AGAIN):
                 group = file[key]
                 require(isinstance(group, h5py.Group), f"{path}: {key}", "a group with position", str(group))
                 members = {name: _dataset(f"{path}: {key}", group, name) for name in group}
@@ -234,7 +234,7 @@ def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Traject
         raise ConfigError(f"{name}: position is missing; it has {', '.join(members) or 'nothing'}")
     types = members.get("particle_type")
     if types is None:
-        require(info.format == "plain", f"{name}: particle_type", "there", None)
+        require(info.format == "plain", f"{name}: particle_type", "present", None)
         for key in members:
             other = key == "material_property" or not re.search("type|material", key, re.IGNORECASE)
             require(other, f"{name}: {key}", "named particle_type", key, "rename it")
@@ -251,7 +251,7 @@ def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Traject
         rule = "whole numbers [K, 3]"
         fits = cell.dtype.kind in "iu" and cell.ndim == 2 and cell.shape[1] == 3
         require(fits, f"{name}: obstacle_cell", rule, f"{cell.dtype} {list(cell.shape)}")
-        require(normal is not None, f"{name}: obstacle_normal", "there with obstacle_cell", None)
+        require(normal is not None, f"{name}: obstacle_normal", "given with obstacle_cell", None)
         normal = floats(f"{name}: obstacle_normal", normal, cell.shape)
         _require_cells(name, cell, normal)
     gravity = members.get("gravity")
@@ -266,19 +266,19 @@ def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Traject
 
 def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> None:
     lowest, highest = cell_K3.min(initial=0), cell_K3.max(initial=0)
-    require(lowest >= -1 and highest < MOST_CELLS, f"{name}: obstacle_cell", "cells of the box", [lowest, highest])
+    require(lowest >= -1 and highest < MOST_CELLS, f"{name}: obstacle_cell", "cells inside the box", [lowest, highest])
     alike = len(cell_K3) - len(np.unique(cell_K3, axis=0))
-    require(alike == 0, f"{name}: obstacle_cell", "each there once", f"{alike} again")
+    require(alike == 0, f"{name}: obstacle_cell", "unique", f"{alike} repeated")
     length_K = np.linalg.norm(normal_K3, axis=1)
     require(bool((np.abs(length_K - 1) < 1e-3).all()), f"{name}: obstacle_normal", "of length 1", float(length_K.max()))
 
 
 def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
-    """Returns K properties of each particle, float32 [N, K], where the file may have a row for each or one for all."""
+    """Returns K properties of each particle, float32 [N, K]. The file has a row for each particle, or one for all."""
     if given is None:
         return None
     array = as_array(f"{name}: material_property", given)
-    rule = f"numbers of one or {count} particles"
+    rule = f"numbers for one or {count} particles"
     plain = array.dtype.kind in "iuf" and array.dtype.itemsize <= 8
     fits = plain and array.ndim <= 2 and (array.ndim == 0 or len(array) in (1, count))
     require(fits, f"{name}: material_property", rule, f"{array.dtype} {list(array.shape)}")
@@ -298,7 +298,7 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]
         if types.ndim == 1 and len(types) == particles.shape[1] + boundary.shape[1]:  # the boundary's types come first
             types = types[boundary.shape[1] :]
         moved = np.abs(boundary - boundary[:1]).max(initial=0)
-        require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a motion by {moved:.3g}")
+        require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a displacement of {moved:.3g}")
         members = {"position": particles, "particle_type": types}
         members |= {"boundary": boundary[0]} if boundary.size else {}
         if own is not None and info.gravity is None:  # these sets have a gravity for each simulation
@@ -326,11 +326,11 @@ _EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015
 
 
 def _opened(path: Path) -> h5py.File:
-    return open_hdf5(path, f"{path} must be a whole HDF5 file", _AGAIN)
+    return open_hdf5(path, f"{path} must be a complete HDF5 file", _AGAIN)
 
 
 def _dataset(name: str, group: h5py.Group, key: str) -> np.ndarray:
-    with damage_named(f"{name}: {key} must be there, and whole", _AGAIN):
+    with damage_named(f"{name}: {key} must be present and complete", _AGAIN):
         dataset = group[key]
         require(isinstance(dataset, h5py.Dataset), f"{name}: {key}", "a dataset", type(dataset).__name__)
         return np.asarray(dataset[()])
@@ -356,5 +356,5 @@ def _metadata(folder: Path) -> dict[str, Any]:
 def _number(key: object, folder: Path) -> int:
     if re.fullmatch(r"0|-?[1-9][0-9]{0,17}", str(key)) is None:
         rule = "names by the number of a particle type"
-        raise ConfigError(f"materials must be {rule}, got {key!r:.60} of {folder}; as in materials={{7: goop}}")
+        raise ConfigError(f"materials must be {rule}, got {key!r:.60} in {folder}; as in materials={{7: goop}}")
     return int(str(key))

@@ -19,20 +19,20 @@ LARGEST = 4_000_000  # largest number of a trajectory's coordinates that are pro
 def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[float, ...]:
     """Returns the acceleration of free flight, length per second squared, from positions [T, N, D].
 
-    A stretch is in flight if its accelerations are equal and not zero, which excludes rest, even sliding and
+    A stretch is in flight if its accelerations are equal and not zero, which excludes rest, uniform sliding and
     collisions. The accuracy is that of positions in float32.
-    Raises: ConfigError if too few particles fly, or if their accelerations differ.
+    Raises: ConfigError if too few particles are in free flight, or if their accelerations differ.
     """
     acceleration_SD = np.concatenate([_flights(path_TND) for path_TND in paths])
     count = len(acceleration_SD)
-    remedy = f"give it, as in gravity={'[0,-9.8]' if acceleration_SD.shape[-1] == 2 else '[0,-9.8,0]'}"
-    require(count >= FEWEST, "gravity", f"given where fewer than {FEWEST} particles fall", count, remedy)
+    remedy = f"give it, for example gravity={'[0,-9.8]' if acceleration_SD.shape[-1] == 2 else '[0,-9.8,0]'}"
+    require(count >= FEWEST, "gravity", f"given if fewer than {FEWEST} particles fall freely", count, remedy)
     middle_D = np.median(acceleration_SD, axis=0)
     alike_S = np.linalg.norm(acceleration_SD - middle_D, axis=-1) <= ALIKE * np.linalg.norm(middle_D)
     if alike_S.mean() < 0.5:
         raise ConfigError(
-            f"gravity must be given where particles fly differently: {alike_S.mean():.0%} of {count} accelerate "
-            f"alike; {remedy}"
+            f"gravity must be given if accelerations in free flight differ, got {alike_S.mean():.0%} of {count} that "
+            f"agree; {remedy}"
         )
     mean_D = acceleration_SD[alike_S].mean(axis=0) / frame_dt_s**2
     size = np.linalg.norm(mean_D)

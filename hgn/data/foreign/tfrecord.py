@@ -25,11 +25,11 @@ def read_records(path: Path) -> Iterator[bytes]:
         while head := file.read(12):
             name = f"{path}: record {number}"
             if len(head) < 12:
-                raise ConfigError(f"{name}: length must have 12 bytes, got {len(head)}: the file is cut")
+                raise ConfigError(f"{name}: length must have 12 bytes, got {len(head)}: file truncated")
             (length,) = struct.unpack("<Q", head[:8])
             _require_crc(f"{name}: length", head[:8], head[8:])
             if length > size - file.tell() - 4:
-                raise ConfigError(f"{name}: data must have {length} bytes, got {size - file.tell()}: the file is cut")
+                raise ConfigError(f"{name}: data must have {length} bytes, got {size - file.tell()}: file truncated")
             data = file.read(length)
             _require_crc(f"{name}: data", data, file.read(4))
             yield data
@@ -97,7 +97,7 @@ def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
         elif kind in (_FIXED64, _FIXED32):
             place += 8 if kind == _FIXED64 else 4
             if place > len(data):
-                raise ValueError("a number that is cut")
+                raise ValueError("a truncated number")
         else:
             raise ValueError(f"a field of wire type {kind}")
 

@@ -67,9 +67,9 @@ class SetInfo:
         require(ordered, "metadata.json: bounds", "low < high, from -1e9 to 1e9", self.bounds)
         longest = max(high - low for low, high in self.bounds)
         key = "metadata.json: default_connectivity_radius"
-        rule = f"{longest / MOST_RADII:.3g} or more, the box being {longest:g} wide"
+        rule = f"at least {longest / MOST_RADII:.3g} for a box of width {longest:g}"
         require(self.radius * MOST_RADII >= longest, key, rule, self.radius)
-        require(self.radius <= longest, key, f"at most the box, {longest:g}", self.radius)
+        require(self.radius <= longest, key, f"at most the width of the box, {longest:g}", self.radius)
         cell_size = self.obstacle_cell_size
         fits = cell_size is None or longest <= cell_size * MOST_CELLS <= longest * MOST_CELLS
         rule = f"from {longest / MOST_CELLS:.3g} to {longest:g}, the width of the box"
@@ -159,6 +159,6 @@ def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
     spacing = max(float(np.spacing(largest)), *(_step(part, radius) for part in (path_TnD, *axes)))
     if not spacing <= COARSEST * radius:
         raise ConfigError(
-            f"{name}: position must have numbers at most {COARSEST * radius:.2g} apart, 0.001 radii, got "
-            f"{spacing:.2g} of {stored.dtype} at coordinates up to {largest:.3g}; subtract an offset before rounding"
+            f"{name}: position must have a resolution of {COARSEST * radius:.2g} (0.001 radii) or finer, got "
+            f"{spacing:.2g} in {stored.dtype} at coordinates up to {largest:.3g}; subtract an offset before rounding"
         )
