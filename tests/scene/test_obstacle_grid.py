@@ -133,15 +133,6 @@ def test_surfaces_without_area():
     assert len(mixed.cell_K3) > 50 and np.isfinite(mixed.normal_K3).all()
 
 
-def test_same_seed_same_grid():
-    """Two builds agree bitwise; another seed gives other samples."""
-    shapes = [shape_obstacle("half_sphere", 0.3, (0.5, 0.5, 0.5), TILT)]
-    first, second, other = (build_obstacle_grid(shapes, CELL, seed) for seed in (5, 5, 6))
-    assert first.cell_K3.tobytes() == second.cell_K3.tobytes()
-    assert first.normal_K3.tobytes() == second.normal_K3.tobytes()
-    assert first.normal_K3.tobytes() != other.normal_K3.tobytes()
-
-
 def test_a_mesh_far_larger_than_the_domain_is_cut_to_it():
     """A floor of 10^6 domain widths costs no more than the part inside, within a cell of the domain."""
     floor = sheet(0.5)
