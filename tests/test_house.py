@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_974,
-    "datagen": 8_937,
-    "tools": 6_348,
-    "tests": 34_790,
+    "hgn": 33_966,
+    "datagen": 8_929,
+    "tools": 6_344,
+    "tests": 34_762,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -312,16 +312,8 @@ def _progress(manifest: Manifest, pool: PoolState) -> dict[str, object]:
         "shards": len(manifest.shards),
         "bytes": sum(total.bytes for total in manifest.totals.values()),
         "quarantined": manifest.shards.state.quarantined,
-        "generator": {
-            "status": pool.status,
-            "starts": pool.starts,
-            "done": pool.done,
-            "total": pool.total,
-            "frames": pool.frames,
-            "running": [{"frame": frame, "scenes": scenes} for frame, scenes in pool.running.values()],
-            "error": pool.error,
-            "log_error": pool.log_error,
-        },
+        "generator": vars(pool)
+        | {"running": [{"frame": frame, "scenes": scenes} for frame, scenes in pool.running.values()]},
     }
 
 

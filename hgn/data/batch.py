@@ -23,6 +23,12 @@ from hgn.scene.history import window
 from hgn.scene.moving import moving_of_episode
 from hgn.scene.symmetry import Symmetry
 
+# fields that a batch has in common with a ParticleState
+OF_STATE = (
+    *("material_N", "scene_N", "domain_S3", "gravity_S3", "obstacles"),
+    *("wall_friction_S3", "parameter_NP", "rest", "moving"),
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Batch:
@@ -45,31 +51,17 @@ class Batch:
     moving: MovingObstacles | None = None  # as in ParticleState
 
     def to(self, device: torch.device, non_blocking: bool = False) -> "Batch":
-        names = ["window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3", "wall_friction_S3", "parameter_NP"]
-        names += ["rest", "moving"]
-        own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        moved: dict[str, Any] = {name: tensor.to(device, non_blocking=non_blocking) for name, tensor in own.items()}
-        obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
-        return replace(self, obstacles=obstacles, **moved)
+        own = {name: value for name in ("window_WN3", *OF_STATE) if (value := getattr(self, name)) is not None}
+        moved: dict[str, Any] = {name: value.to(device, non_blocking=non_blocking) for name, value in own.items()}
+        return replace(self, **moved)
 
     def state(self, window_WN3: torch.Tensor | None = None) -> ParticleState:
         """Returns the network's input at frame n from this window, or from a perturbed copy of it."""
         if window_WN3 is None:
             window_WN3 = self.window_WN3
         velocity_MN3 = (window_WN3[1:-1] - window_WN3[:-2]).flip(0)
-        return ParticleState(
-            position_N3=window_WN3[-2],
-            velocity_NM3=velocity_MN3.transpose(0, 1),
-            material_N=self.material_N,
-            scene_N=self.scene_N,
-            domain_S3=self.domain_S3,
-            gravity_S3=self.gravity_S3,
-            obstacles=self.obstacles,
-            wall_friction_S3=self.wall_friction_S3,
-            parameter_NP=self.parameter_NP,
-            rest=self.rest,
-            moving=self.moving,
-        )
+        own: dict[str, Any] = {name: getattr(self, name) for name in OF_STATE}
+        return ParticleState(position_N3=window_WN3[-2], velocity_NM3=velocity_MN3.transpose(0, 1), **own)
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
         """Returns v^{n+1} - v^n in frame units, [N, 3]."""

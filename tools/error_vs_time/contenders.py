@@ -6,7 +6,6 @@ Shape legend: T frames, N particles of a scene.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
-from hgn.training.errors import Predictor, SquaredError, network_predictor
+from hgn.training.errors import PARTICLES_PER_BATCH, Predictor, SquaredError, groups_of_frames, network_predictor
 from tools.solver_rollouts import OnFrame, Setting, SolverLaunches
 from tools.timing import matmul_precision
 
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from hgn.runtime.triton_backend import TritonBackend
 
 Row = dict[str, Any]
-PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # particles per batch of one-step errors with backend triton
 REST_SPEED = 1e-4  # domain units per frame; slower particles are at rest
 
@@ -198,12 +196,10 @@ def one_step(
 ) -> OneStep:
     """Measures a predictor on every stride-th frame of an episode, without noise."""
     result = OneStep()
-    frames = list(range(0, len(episode.position_TN3) - 1, stride))
-    together = max(1, particles_per_batch // max(1, len(episode.material_N)))
-    together = math.ceil(len(frames) / math.ceil(len(frames) / together))  # batches of similar sizes
+    pairs = [(episode, n) for n in range(0, len(episode.position_TN3) - 1, stride)]
     with torch.inference_mode():
-        for first in range(0, len(frames), together):
-            batch = make_batch([(episode, n) for n in frames[first : first + together]], network).to(device)
+        for group in groups_of_frames(pairs, particles_per_batch):
+            batch = make_batch(group, network).to(device)
             predicted_N3, true_N3 = predict(batch), batch.acceleration()
             result.error.add((predicted_N3 - true_N3).square().sum(-1), batch.material_N, network.materials)
             speed_NM = batch.state().velocity_NM3.norm(dim=-1)
