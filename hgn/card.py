@@ -41,11 +41,11 @@ class CardConfig:
 
     def __post_init__(self) -> None:
         one = (self.weights is None) != (self.data is None)
-        require(one, "weights", "given, or else data", [self.weights, self.data])
+        require(one, "weights", "given, or data, but not both", [self.weights, self.data])
         rule = "a folder, given together with weights"
         require((self.weights is None) == (self.out is None), "out", rule, self.out)
         plain = re.fullmatch(r"[a-z0-9.-]+", self.license) is not None
-        require(plain, "license", "a name as the Hub has them, for example mit or cc-by-4.0", self.license)
+        require(plain, "license", "the Hub's name of a licence, for example mit or cc-by-4.0", self.license)
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -63,7 +63,7 @@ def main(mapping: dict[str, Any]) -> int:
         require(same, "out", f"a folder without another {path.name}", str(folder))
     else:
         assert config.data is not None
-        require(not is_remote(config.data), "data", "a folder of this machine", config.data)
+        require(not is_remote(config.data), "data", "a local folder", config.data)
         folder = Path(config.data)
         manifest = Manifest.load(folder)
         with errors_in_config(folder):
@@ -132,7 +132,7 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
 def _reference_row(reference: dict[str, Any] | None) -> dict[str, str]:
     if reference is None:
         return {}
-    children = f"{reference['particles_per_visible']} there, {reference['visible']}"
+    children = f"{reference['particles_per_visible']} on this grid, {reference['visible']}"
     return {"simulated on": f"{reference['cells']} cells per unit; each particle stands for {children}"}
 
 

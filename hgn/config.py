@@ -68,7 +68,7 @@ def config_directory() -> Path:
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "datagen.yaml").is_file():
             return candidate
-    raise ConfigError(f"conf/ must lie inside or beside {package}, got neither; reinstall the package")
+    raise ConfigError(f"conf/ must be in {package} or next to it, got neither; reinstall the package")
 
 
 def is_mesh_file(name: str | Path) -> bool:
@@ -94,7 +94,7 @@ class SceneConfig:
     maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; moving groups draw a velocity
     # fraction of groups with an initial velocity, if maximum_initial_speed is above 0
     moving_group_fraction: Fraction[float] = 1.0
-    lone_particles: NonNegative[int] = 0  # single particles far from all others; without them such particles hang
+    lone_particles: NonNegative[int] = 0  # single particles far from all others, so that networks learn their fall
     # fraction of moving groups whose velocity is exactly along gravity, against it or perpendicular to it
     pure_direction_fraction: Fraction[float] = 0.0
     colliding_scene_fraction: Fraction[float] = 0.0  # fraction of scenes with colliding groups and without obstacles
@@ -120,7 +120,7 @@ class SceneConfig:
         require(other <= 1, "tilted_gravity_fraction", rule, self.tilted_gravity_fraction)
         for name in ("pure_direction_fraction", "colliding_scene_fraction"):
             moving = self.maximum_initial_speed > 0 or getattr(self, name) == 0
-            require(moving, "maximum_initial_speed", f"above 0 where {name} is", self.maximum_initial_speed)
+            require(moving, "maximum_initial_speed", f"above 0 if {name} is", self.maximum_initial_speed)
         for name in ("obstacle_size", "funnel_hole"):
             low, high = getattr(self, name)
             require(0 < low <= high < math.inf, name, "0 < smallest <= largest", [low, high])
@@ -131,7 +131,7 @@ class SceneConfig:
         require_kinds(self)
         require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))
         require(len(self.group_shapes) > 0, "group_shapes", "a list with at least one shape", [])
-        rule = "a list with at least one shape where obstacle_count > 0"
+        rule = "a list with at least one shape if obstacle_count > 0"
         require(self.obstacle_count == 0 or len(self.obstacle_shapes) > 0, "obstacle_shapes", rule, [])
 
     @property
@@ -252,7 +252,7 @@ class DatagenConfig:
         whole = all(abs(edge * cells - round(edge * cells)) < 1e-3 for edge in self.scene.domain_size)
         require(whole, name, "such that domain_size is a whole number of its cells", round(cells))
         step_s = self.mpm.fixed_time_step_s
-        require(step_s is None, "mpm.fixed_time_step_s", f"null with {name}, which chooses its own", step_s)
+        require(step_s is None, "mpm.fixed_time_step_s", f"null with {name}, which determines the step", step_s)
 
     @property
     def reference_cell_size(self) -> float:
@@ -306,10 +306,10 @@ class NetworkConfig:
         rule = "false with inputs=absolute or obstacle_features=false"
         require(sees or not self.obstacle_distance, "obstacle_distance", rule, True)
         whole = "elastic" in self.materials or "elastic" not in self.own_physics
-        require(whole, "materials", "with elastic where own_physics has it", list(self.materials))
+        require(whole, "materials", "a list with elastic if own_physics contains it", list(self.materials))
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
-            rule = f"at least 2 with inputs={self.inputs}, which are of differences"
+            rule = f"at least 2 with inputs={self.inputs}, which use differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         if self.kind == "gns":
             require(self.levels == 1, "levels", "1 for gns: the particles themselves", self.levels)
@@ -333,8 +333,8 @@ class NetworkConfig:
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + MATERIAL_EMBEDDING
 
 
-# Number of plane waves in correlated noise, and the range of their lengths in finest cells. Short waves stir a body,
-# long waves shift it.
+# Number of plane waves in correlated noise, and the range of their lengths in finest cells. Short waves deform a
+# body, long waves move it.
 CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 
 
@@ -429,13 +429,13 @@ class TrainConfig:
         self.step.require_fits(self.network.relative, self.network.dimensions)
         rule, dimensions = "3 for data that are not imported", self.network.dimensions
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
-        rule = "relative where scene.kinds are given, or zero_gravity_fraction or tilted_gravity_fraction is above 0"
+        rule = "relative if scene.kinds are given, or zero_gravity_fraction or tilted_gravity_fraction is above 0"
         require(self.network.relative or self.scene.upright, "network.inputs", rule, self.network.inputs)
         sees, remedy = self.network.obstacle_features, "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0"
         rule = "true for scenes with obstacles"
         require(sees or self.scene.obstacle_count == 0, "network.obstacle_features", rule, False, remedy)
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
-        rule = f"at least {SIMULATED_FRAMES} where training.pushforward_fraction > 0"
+        rule = f"at least {SIMULATED_FRAMES} if training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)
         names = () if self.imported else (*self.scene.materials, *({"elastic"} & {*self.scene.own_physics}))
         unknown = [name for name in names if name not in self.network.materials]

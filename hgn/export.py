@@ -32,9 +32,9 @@ class ExportConfig:
     weights: str | None = None  # file or name of shipped weights; only without checkpoint
     out: FileName | None = None  # the weights file to write
     stored_precision: StoredPrecision = "fp32"  # precision of the learned tensors; fp16 makes files half as large
-    rest_threshold: NonNegative[float] | None = None  # step.rest_threshold of `out`; null: as it was
-    wall_clearance: WallClearance | None = None  # step.wall_clearance of `out`; null: as it was
-    obstacle_clearance: Positive[float] | None = None  # step.obstacle_clearance of `out`; null: as it was
+    rest_threshold: NonNegative[float] | None = None  # step.rest_threshold of `out`; null: unchanged
+    wall_clearance: WallClearance | None = None  # step.wall_clearance of `out`; null: unchanged
+    obstacle_clearance: Positive[float] | None = None  # step.obstacle_clearance of `out`; null: unchanged
     # file for the graph of a step of `out`, or else of `weights`, for ONNX Runtime
     onnx: FileName | None = None
     package: FileName | None = None  # file for a step compiled for `device`, for PyTorch's C++ (.pt2)
@@ -45,12 +45,12 @@ class ExportConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         given = self.checkpoint is not None or self.weights is not None
-        require(given, "checkpoint", "given, or else weights", self.checkpoint)
+        require(given, "checkpoint", "given, or weights instead", self.checkpoint)
         require(self.checkpoint is None or self.weights is None, "weights", "null with checkpoint", self.weights)
         require(self.checkpoint is None or self.out is not None, "out", "given with checkpoint", self.out)
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
         for name, value in self.step_changes.items():
-            require(self.out is not None, name, "null without out, the file that it is for", value)
+            require(self.out is not None, name, "null without out, the file that it changes", value)
         some = any(name is not None for name in (self.out, self.onnx, self.package, self.arrays))
         require(some, "out", "given with weights, or onnx, package or arrays", self.out)
         if self.package is not None:

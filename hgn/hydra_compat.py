@@ -77,7 +77,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     except (TypeError, LookupError, AttributeError, AssertionError) as error:  # Hydra's faults with lists' items
         raise ConfigError(_unread(arguments, error)) from error
     except RecursionError:
-        raise ConfigError("defaults must not lead back to the same file, got a loop of them") from None
+        raise ConfigError("defaults must not refer back to the same file, got a cycle") from None
     finally:
         sys.argv = given
         os.environ.pop("HYDRA_FULL_ERROR", None)
@@ -91,12 +91,12 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
 
 def _unread(arguments: list[str], error: Exception) -> str:
     given = f"{' '.join(arguments[1:])} ({type(error).__name__}: {error})"
-    return f"settings must be as Hydra reads them, got {given}; check lists, their numbers, and ${{…}}"
+    return f"settings must follow Hydra's syntax, got {given}; check lists, their numbers, and ${{…}}"
 
 
 @contextmanager
 def _strict_files() -> Iterator[None]:
-    """Lets Hydra read files as `read_yaml` does. It would ignore lists and byte order marks, and misread numbers."""
+    """Makes Hydra read files as `read_yaml` does. Hydra ignores lists and byte order marks, and misreads numbers."""
     from hydra._internal.sources_registry import SourcesRegistry
     from hydra.core.plugins import Plugins
 
@@ -108,7 +108,7 @@ def _strict_files() -> Iterator[None]:
         file = Path(source.path, source._normalize_file_name(config_path))
         if file.is_file():
             if file.read_bytes().startswith(codecs.BOM_UTF8):
-                raise ConfigError(f"{file} must be UTF-8 without a byte order mark; save it so")
+                raise ConfigError(f"{file} must be UTF-8 without a byte order mark; save it as such")
             if not isinstance(content := read_yaml(file), dict | None):
                 raise ConfigError(f"{file} must be a mapping of keys to values, got {content!r:.60}")
         return load(source, config_path)
@@ -121,7 +121,7 @@ def _strict_files() -> Iterator[None]:
 
 
 def _check_options(arguments: list[str]) -> None:
-    """Raises ConfigError for wrong values of Hydra's options, for which Hydra would print a whole page."""
+    """Raises ConfigError for wrong values of Hydra's options. Hydra would print a whole page."""
     from hydra._internal.utils import get_args_parser
 
     parser = get_args_parser()
@@ -129,10 +129,10 @@ def _check_options(arguments: list[str]) -> None:
     try:
         _, apart = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
-        raise ConfigError(f"Hydra's options must be as in --cfg job, got {error}") from None
+        raise ConfigError(f"Hydra's options must have the form --cfg job, got {error}") from None
     if apart:
-        rule = "settings must stand together"
-        raise ConfigError(f"{rule}, got {' '.join(apart)} apart from them; put all before or after Hydra's options")
+        rule = "settings must be consecutive"
+        raise ConfigError(f"{rule}, got {' '.join(apart)} separately; put all before or after Hydra's options")
 
 
 def dataclass_of(file: Path) -> type | None:

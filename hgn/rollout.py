@@ -78,8 +78,8 @@ class RolloutConfig(SimulatorConfig):
             self.data,
             "for example data=data/obstacles episode=validation-000000",
         )
-        require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
-        rule, remedy = "left out where scene or data is given", "a scene file has its own"
+        require(self.scene is None or self.data is None, "scene", "left out if data is given", self.scene)
+        rule, remedy = "left out if scene or data is given", "a scene file has its own"
         require(self.seed is None or self.scene is self.data is None, "seed", rule, self.seed, remedy)
         require_rollout_name("out", self.out, *USD_ENDINGS, PLY_ENDING)
 
@@ -122,8 +122,8 @@ def main(mapping: dict[str, Any]) -> int:
 def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     """Simulates a scene or an episode, writes the file, and returns its path and content.
 
-    The file of an episode also has the episode's true positions. Ctrl-C and a simulation that diverges keep the frames
-    so far, which a line reports. Raises ConfigError for bad input or a simulation that diverges.
+    The file of an episode also has the episode's true positions. After Ctrl-C or a divergence the file contains the
+    frames so far, and a line reports this. Raises ConfigError for bad input or a simulation that diverges.
     """
     with loading():
         from hgn.render.exchange import require_exchange, save_frames
@@ -166,10 +166,10 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     fastest = float(np.linalg.norm(initial.velocity_N3.astype(np.float64), axis=-1).max(initial=0.0))
     if not (relative and limit is None) and fastest > (limit or 0.0) * (1 + SAME_SPEED):
         known = "an unknown speed; " if limit is None else f"up to {limit:g}; beyond that "
-        flight = "motion is a guess, and exact with weights=own_physics in flight"
+        flight = "motion is unreliable, but free flight is exact with weights=own_physics"
         print(
-            f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "
-            f"{weights.stem} with {known}{'collisions and contacts are a guess' if relative else flight}",
+            f"velocity: groups start with up to {fastest:.3g} domain units per second, in the data of {weights.stem} "
+            f"with {known}{'collisions and contacts are unreliable' if relative else flight}",
             file=sys.stderr,
         )
     print(simulator.backend.note, file=sys.stderr)
@@ -204,7 +204,7 @@ def _shown(simulated: Iterator[np.ndarray], count: int, weights: Path) -> Genera
                 yield position_N3
                 progress.update()
         except DivergedError as error:
-            raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
+            raise ConfigError(f"weights must simulate without divergence, got {weights}: {error}") from error
 
 
 def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[str]:
@@ -222,7 +222,7 @@ def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator
         values = own.get(name, scene.material_parameters.get(name, np.zeros(0)))
         far = values[(values < low * (1 - SAME_SPEED)) | (values > high * (1 + SAME_SPEED))]
         if len(far) and name in (*used, *inputs):
-            yield f"{name}: {far[0]:.4g}, those of the data of {weights} are {low:g} to {high:g}; motion is a guess"
+            yield f"{name}: {far[0]:.4g}, the data of {weights} have {low:g} to {high:g}; motion is unreliable"
 
 
 def _out(config: RolloutConfig) -> Path:
@@ -238,7 +238,7 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> Scene:
     if config.scene is not None:
         return load_scene(find_scene(config.scene))
     own = [name for name in info.network.materials if name not in MATERIALS]
-    rule = "given with weights of imported data, which random scenes are not like"
+    rule = "given with weights of imported data, which differ from random scenes"
     imported = info.network.dimensions != 3 or bool(own)
     require(not imported, "data", rule, None, "for example data=data/mine episode=validation-000000")
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)

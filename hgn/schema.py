@@ -214,7 +214,7 @@ def from_stored(cls: type[T], mapping: object, section: str) -> T:
 
 
 def known_keys(key: str, names: Iterable[str], what: str = "known keys") -> str:
-    """Returns the remedy for an unknown key: a similar key, or else all keys. `what` is what a message calls them."""
+    """Returns the remedy for an unknown key: a similar key, or else all keys. `what` is their name in the message."""
     names = list(names)
     return near_name(key, names) or f"{what}: {', '.join(names)}"
 
@@ -346,7 +346,7 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
             raise ConfigError(f"{_text(path)} must be text without control characters, got {_shown.repr(value)}")
         return value
     if type(value) is int and not -(2**63) <= value < 2**63:
-        raise ConfigError(f"{_text(path)} must be a number of at most 63 bits, got one of {value.bit_length()}")
+        raise ConfigError(f"{_text(path)} must be a number of at most 63 bits, got {value.bit_length()} bits")
     origin, arguments, is_dataclass = _shape(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

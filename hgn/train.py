@@ -55,7 +55,7 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(TrainConfig, settings_of_imported(mapping))
     require_replaceable("run", Path(config.run) / "config.yaml")
     if not first_on_machine():
-        # If the process that started this rank ends, the rank ends at the same time, not only after a time-out.
+        # If the process that started this rank ends, the rank ends immediately instead of after a time-out.
         die_with_parent(signal.SIGKILL)
     layout(config.training)
     for i, logger in enumerate(config.training.loggers):
@@ -90,7 +90,7 @@ def main(mapping: dict[str, Any]) -> int:
         precompilation = precompile_kernels(config, resume, stack)
         store = wait_for_episodes(config, generator, stop, others)
         if store is None:
-            lost = "whole scenes are kept, scenes in the middle of their simulation begin anew"
+            lost = "finished scenes are kept, interrupted simulations start again"
             print(f"stopped before the first episode was published; {lost}; the same command resumes", file=sys.stderr)
             return stop.exit_code
         missing = missing_scenes(config, store.manifest, ("train", "validation"))
@@ -116,7 +116,7 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
             checkpoint = read_checkpoint(path)
             break
         except DamagedError as error:
-            print(f"{error}; trying the one before", file=sys.stderr)
+            print(f"{error}; trying the previous one", file=sys.stderr)
             damaged = damaged or error
     else:
         if damaged is not None:
@@ -142,11 +142,11 @@ def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetw
         return None
     if resume is not None:
         if first_rank():
-            print(f"training.init_weights={weights} is not read: the run goes on from {resume.path}", file=sys.stderr)
+            print(f"training.init_weights={weights} is not read: the run continues from {resume.path}", file=sys.stderr)
         return None
     network = network_of_weights(config)
     if first_rank():
-        print(f"begins with the weights and the normaliser of {weights}", file=sys.stderr)
+        print(f"starting with the weights and the normaliser of {weights}", file=sys.stderr)
     return network
 
 

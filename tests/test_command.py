@@ -91,7 +91,7 @@ def test_loops_of_defaults(tmp_path, command):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(HEAD + "defaults: [mine]\n")
     code, _, error = command("train", f"--config-dir={tmp_path}", "experiment=mine")
-    assert (code, error) == (2, "error: defaults must not lead back to the same file, got a loop of them\n")
+    assert (code, error) == (2, "error: defaults must not refer back to the same file, got a cycle\n")
 
 
 @pytest.mark.parametrize(
@@ -194,15 +194,15 @@ def test_groups_and_included_files(tmp_path, command):
     ("arguments", "message"),
     [
         *(
-            (arguments, "Hydra's options must be as in --cfg job, got argument --cfg/-c: ")
+            (arguments, "Hydra's options must have the form --cfg job, got argument --cfg/-c: ")
             for arguments in (["--cfg", "foo"], ["--cfg=foo"], ["-c", ""], ["--cfg"], ["--cfg", "job", "--cfg"])
         ),
         (["--info", "foo"], "got argument --info/-i: invalid choice: 'foo'"),
         (["--cfg", "job", "--package"], "got argument --package/-p: expected one argument"),
         (["--config-name"], "got argument --config-name/-cn: expected one argument"),
         (["--resolve=3"], "got argument --resolve: ignored explicit argument '3'"),
-        (["frames=3", "--cfg", "job", "seed=4"], "settings must stand together, got seed=4 apart from them"),
-        (["hydra.job.env_copy=[NONE]"], "as Hydra reads them, got hydra.job.env_copy=[NONE] (KeyError: 'NONE')"),
+        (["frames=3", "--cfg", "job", "seed=4"], "settings must be consecutive, got seed=4 separately"),
+        (["hydra.job.env_copy=[NONE]"], "follow Hydra's syntax, got hydra.job.env_copy=[NONE] (KeyError: 'NONE')"),
         (["hydra.searchpath=[file:///none]"], "path=/none is not available"),
         (["--experimental-rerun=x"], "Experimental rerun CLI option, other command line args are ignored"),
         (["--cfg", "job", "--package", "none"], "package 'none' not found in config"),

@@ -41,7 +41,7 @@ class Barriers:
         cell_size, *others = sorted({barrier.cell_size for barrier in barriers if len(barrier.row_F24)})
         values = tuple(size / CELLS for size in (cell_size, *others))
         rule = "one for all scenes of a batch with obstacle_clearance"
-        require(not others, "cell_size", rule, values, "simulate scenes of other cells by themselves")
+        require(not others, "cell_size", rule, values, "simulate scenes of other cell sizes separately")
         keys = [
             pack(torch.full((len(b.cell_Q3),), scene), torch.from_numpy(b.cell_Q3.astype(np.int64)))
             for scene, b in enumerate(barriers)
@@ -67,7 +67,7 @@ class Barriers:
 
 
 def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
-    """Returns the rows of triangles (see hgn.scene.barrier), float64 [F, 24], differentiable by the corners.
+    """Returns the rows of triangles (see hgn.scene.barrier), float64 [F, 24], differentiable in the corners.
 
     The row of a triangle without area covers no point.
     """

@@ -67,7 +67,7 @@ class RestShape:
 
     @staticmethod
     def unpacked(packed_NR: torch.Tensor, position_N3: torch.Tensor) -> RestShape:
-        """Returns the shape of `packed`. The places are only for fits of remaining neighbours."""
+        """Returns the shape of `packed`. The places are used only if particles lose neighbours."""
         coefficient_NR = packed_NR[:, NEIGHBOURS:].contiguous().view(torch.float32)
         return RestShape(packed_NR[:, :NEIGHBOURS].long(), position_N3, coefficient_NR.unflatten(1, (NEIGHBOURS, 4)))
 
@@ -79,7 +79,7 @@ class RestShape:
 
     @staticmethod
     def joined(shapes: Sequence[RestShape | None], counts: Sequence[int]) -> RestShape | None:
-        """Returns one shape for several scenes, or states, of `counts` particles. None stands for one without."""
+        """Returns one shape for several scenes, or states, of `counts` particles. None means no elastic particles."""
         known = [shape for shape in shapes if shape is not None]
         if not known:
             return None

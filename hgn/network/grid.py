@@ -140,8 +140,8 @@ def build_hierarchy(
 def _bodies(cell_N8: torch.Tensor, count: int) -> torch.Tensor:
     """Returns the body of each finest cell, int64 [C]: its lowest cell.
 
-    In each round a cell, and the cell that it links to, take the lowest link of the cells that particles connect them
-    with. Then links are followed once (as in Zhang, Azad and Hu 2020). A graph for export has a fixed number of rounds.
+    In each round a cell, and the cell that it links to, get the lowest link among the cells that share a particle with
+    them. Then links are followed once (as in Zhang, Azad and Hu 2020). An exported graph has a fixed number of rounds.
     """
     # The cells of all particles whose first cell is this one. An entry without a particle is the cell itself.
     own_C = torch.arange(count, device=cell_N8.device)

@@ -9,7 +9,7 @@ R and p are the obstacle's rotation and the place of its pivot in this frame, R'
 domain units per frame. A particle at x moves relative to the obstacle by v - V(x). docs/concepts/method.md lists where
 the network uses v - V.
 
-Tensors have one row for each obstacle. Obstacle j of scene s has the row j S + s. Scenes with fewer than J moving
+Tensors have one row for each obstacle. Obstacle j of scene s has row j S + s. Scenes with fewer than J moving
 obstacles have rows without cells. The key of a cell or triangle contains its place and a number: its scene's for
 obstacles at rest, its row's for moving obstacles.
 Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, C coarsest cells, V (in names of
@@ -110,7 +110,7 @@ class MovingObstacles:
         network: NetworkConfig,
         clearance: float | None = None,
     ) -> MovingObstacles | None:
-        """Returns the moving obstacles of scenes as a network sees them, scene s at frames[s]; None if none moves."""
+        """Returns the moving obstacles of scenes as network inputs, scene s at frames[s]; None if none moves."""
         if not any(scenes):
             return None
         rows, cells = [row for layer in zip_longest(*scenes) for row in layer], None

@@ -118,8 +118,8 @@ def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: tor
 def wall_contact(wall_N6: torch.Tensor, local: bool) -> torch.Tensor:
     """Returns from `relative.wall_nearness` how far walls can push particles, 0 to 1, [N, 6].
 
-    A network sees walls before they can push. With `local` inputs only walls that can push hold a body, so a ceiling
-    does not hold what slides down a slope below it. Otherwise walls push from where they are seen.
+    A network sees walls before they can push. With `local` inputs only walls that can push constrain a body, so a
+    ceiling does not stop bodies that slide down a slope below it. Otherwise walls push as soon as they are seen.
     """
     first = FREE_NEARNESS if local else 0.0
     return ((wall_N6 - first) / (FULL_NEARNESS - first)).clamp(0, 1)

@@ -2,9 +2,9 @@
 
 An obstacle's cells are computed once, at its place in the scene. A particle is expressed in that frame by
 x' = R^T (x - t - c) + c with pivot c. The normal n found there becomes R n, so its direction follows the rotation
-exactly. The cell of a particle is piecewise constant, so n has no gradient by shifts or by distance from the surface.
-With `smoothing` s the normal is the mean over a cube of s cells around the particle. The mean is continuous, and
-piecewise polynomial in position and pose. Networks were trained with s = 0.
+exactly. The cell of a particle is piecewise constant, so n has no gradient with respect to shifts or the distance from
+the surface. With `smoothing` s the normal is the mean over a cube of s cells around the particle. The mean is
+continuous, and piecewise polynomial in position and pose. Networks were trained with s = 0.
 Shape legend: N particles, K obstacle cells.
 """
 
@@ -65,7 +65,7 @@ class PosedObstacleCells(ObstacleCells):
 def smoothed_surfaces(
     cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float
 ) -> torch.Tensor:
-    """Returns means of normals and friction over a cube of `smoothing` cells around each particle, [N, 4]."""
+    """Returns the means of normals and friction over a cube of `smoothing` cells around each particle, [N, 4]."""
     if len(cells.key_K) == 0:
         return position_N3.new_zeros(len(position_N3), 4)
     if smoothing == 0:

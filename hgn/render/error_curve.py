@@ -58,7 +58,7 @@ def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
     Raises ConfigError if the rollout has no ground truth.
     """
     if rollout.reference_TN3 is None:
-        raise ConfigError("reference must be there to measure an error, got a rollout without ground truth")
+        raise ConfigError("reference must be given to measure an error, got a rollout without ground truth")
     frames = min(len(rollout.position_TN3), len(rollout.reference_TN3))
     difference = rollout.position_TN3[:frames].astype(np.float64) - rollout.reference_TN3[:frames]
     square_TN = (difference**2).sum(axis=2)

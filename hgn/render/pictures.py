@@ -131,7 +131,7 @@ def animation_rate(rollout: Rollout, path: str | Path, every: int) -> float:
     rate = rollout.frame_rate_hz / every
     if not 0 < rate <= fastest:
         remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}"
-        raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers keep, got {rate:g}; {remedy}")
+        raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers support, got {rate:g}; {remedy}")
     return rate
 
 
@@ -159,7 +159,7 @@ def particle_spacing(position_N3: np.ndarray) -> float:
     from scipy.spatial import KDTree
 
     if len(position_N3) < 4:
-        return 1 / 128  # spacing of the usual eight particles in a cell of 1/64
+        return 1 / 128  # spacing of eight particles in a cell of 1/64
     sample_N3 = position_N3[:: max(1, len(position_N3) // 2000)]
     return max(float(np.median(KDTree(position_N3).query(sample_N3, k=4)[0][:, 3])), 1e-6)
 

@@ -91,7 +91,7 @@ def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field:
     chosen = backend if backend in running else running[0] if running and backend == "auto" else None
     first = next(iter(reasons))
     if chosen is None:
-        cause = f"{field}=torch was asked for" if backend == "torch" else f"{first}: {reasons[first]}"
+        cause = f"{field}=torch was requested" if backend == "torch" else f"{first}: {reasons[first]}"
         raise ConfigError(f"precision must be tf32 or fp32 on backend torch, got {precision}; {cause}")
     because = f" (not {first}: {reasons[first]})" if backend == "auto" and chosen != first else ""
     where = field.rpartition(".")[0] or "runtime"
@@ -100,7 +100,7 @@ def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field:
 
 def torch_unsupported_reason(precision: str) -> str | None:
     """Returns why PyTorch cannot compute a network, or None."""
-    return "it has no fp16" if precision == "fp16" else None
+    return "it does not support fp16" if precision == "fp16" else None
 
 
 def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str) -> str | None:
@@ -109,7 +109,7 @@ def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precisio
         return f"it needs the CPU, not {device.type}"
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
-    return "it computes float32" if precision == "fp16" else None
+    return "it computes only in float32" if precision == "fp16" else None
 
 
 def triton_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str = "auto") -> str | None:

@@ -174,9 +174,9 @@ def _started(
     require(
         inputs.gravity_3 is None or config.relative,
         "gravity_3",
-        "left out for a network of absolute inputs, which knows no gravity but its data's",
+        "left out for a network with absolute inputs, which supports only the gravity of its data",
         "a tensor",
-        remedy="take weights of relative inputs, as mechanics",
+        remedy="take weights with relative inputs, such as mechanics",
     )
     count = len(scene.position_N3)
     position_N3 = given("position_N3", inputs.position_N3, scene.position_N3, (count, 3))
@@ -206,7 +206,7 @@ def _physics(
     known: dict[str, tuple[int, ...]] = {"wall_friction": (3,)} if "friction" in inputs else {}
     known |= dict.fromkeys(INPUT_PARAMETERS, (count,)) if "parameters" in inputs else {}
     for name, tensor in given.items():
-        require(name in known, "physics", f"of the network's inputs ({', '.join(known) or 'none'})", name)
+        require(name in known, "physics", f"one of the network's inputs ({', '.join(known) or 'none'})", name)
         _tensor(f"physics {name}", tensor, known[name])
     if "wall_friction" in given:
         fields["wall_friction_S3"] = given["wall_friction"][None].to(start.domain_S3.device)
@@ -284,13 +284,13 @@ def _in_motion(
 def _barriers(
     scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
 ) -> Barriers | None:
-    """Returns barriers of the placed obstacles. Rows have gradients by the poses, lists of cells do not."""
+    """Returns barriers of the placed obstacles. Rows are differentiable in the poses, lists of cells are not."""
     cell_size, parts = scene.cell_size, []
     for i, obstacle in enumerate(scene.obstacles):
         if obstacle.motion is not None:
             continue
         staying = i not in placements
-        # not cut at the domain: an obstacle may be moved into it
+        # not clipped at the domain: an obstacle may be moved into it
         piece_F33 = barrier_pieces(obstacle.corners, cell_size, scene.domain_size if staying else None)
         corner_F33 = torch.from_numpy(piece_F33).to(device)
         parts.append(corner_F33 if staying else placements[i].to(torch.float64).place(corner_F33))

@@ -100,7 +100,7 @@ class LiveSimulation:
         return self.advance().position_N3.numpy(force=True).copy()
 
     def reset(self, index: int, scene: InitialState | Scene) -> None:
-        """Starts a scene anew, or another one in its place, with any number of particles.
+        """Restarts a scene, or starts another one in its place, with any number of particles.
 
         Obstacles at rest are prepared again unless `obstacle_grid`, `corners` and the domain size are as before.
         Backend triton captures its CUDA graph again for another domain size. Raises: ConfigError as `Simulator.start`.
@@ -120,7 +120,7 @@ class LiveSimulation:
         was not trained with, and for arrays of different lengths.
         """
         self._require_scene(index)
-        require(index not in self.ended, "index", "of a scene in progress", index, remedy="reset it")
+        require(index not in self.ended, "index", "the index of a scene in progress", index, remedy="reset it")
         count = len(_array("position_A3", position_A3, (None, 3)))
         _array("velocity_A3", velocity_A3, (count, 3))
         _array("material_A", material_A, (count,))
@@ -192,7 +192,7 @@ class LiveSimulation:
             bare.append(replace(scene, obstacle_grid=no_cells, corners=None, moving=()))
         new = self.simulator.start(bare)
         lost_N = diverged(new.position_N3, new.domain_S3[new.scene_N])
-        rule = "finite and within a domain's size of the domain"
+        rule = "finite and no farther from the domain than its own size"
         require(not bool(lost_N.any()), "position_N3", rule, new.position_N3[lost_N][:1].flatten().tolist())
         return new
 

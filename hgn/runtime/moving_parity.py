@@ -1,8 +1,8 @@
 """Compares the constraint at moving obstacles, as compiled for this machine, with PyTorch.
 
-A particle rarely meets a moving obstacle in the first frame. So ways through points of its triangles are compared: a
-way begins at the pose of this frame and ends at that of the next one.
-Shape legend: P ways, at most one for each row of the buffers, S scenes.
+A particle rarely meets a moving obstacle in the first frame. So paths through points of its triangles are compared: a
+path starts at the pose of this frame and ends at that of the next one.
+Shape legend: P paths, at most one for each row of the buffers, S scenes.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ from hgn.runtime.parity import Quantity, require_parity
 from hgn.step.reference import advanced
 from hgn.step_config import StepConfig
 
-WAYS = 1024  # largest number of ways
-# Shifts of the ends of ways, each relative to its size. Rounding changes most of them by 1e-5, far from 0 by 1e-3.
+WAYS = 1024  # largest number of paths
+# Shifts of the ends of paths, each relative to its size. Rounding changes most of them by 1e-5, far from 0 by 1e-3.
 # In a few it chooses between two triangles, so the worst tenth is left out. Wrong poses change them by their size.
 SHIFTS = Quantity("shifts at moving obstacles", 0.05)
 
@@ -35,7 +35,7 @@ def require_moving_parity(
     precision: str,
     section: str = "",
 ) -> None:
-    """Compares moving obstacles, whose present poses `table` has, without obstacles at rest. Changes grid.status.
+    """Compares moving obstacles with the present poses in `table`, without obstacles at rest. Changes grid.status.
 
     Raises: ParityError if the shifts differ.
     """

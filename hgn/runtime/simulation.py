@@ -116,8 +116,8 @@ class Simulation:
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
 
-        Positions are NaN in ended scenes, but for particles in the frame in which they enter, and before a particle
-        enters. Raises: DivergedError without `isolate`.
+        Positions are NaN before a particle enters, and in ended scenes except in the frame in which a particle enters.
+        Raises: DivergedError without `isolate`.
         """
         first, done = self.frame, 0
         entering = [len(entry.state.position_N3) for entry in self.entries if entry.frame <= first + frames]

@@ -330,7 +330,7 @@ class Simulator:
                     name: getattr(own, name) for name in ("position_N3", "velocity_N3", "material_N")
                 }
                 particles["parameters"] = input_parameters(own.material_parameters, {}, own.particle_count)
-                particles |= {"corners": None, "body_N": None, "moving": ()}  # barriers take long and are not needed
+                particles |= {"corners": None, "body_N": None, "moving": ()}  # barriers are slow and not needed
                 new = self.start([replace(state, **particles)])
                 entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))
         return sorted(entries, key=lambda entry: entry.frame)
@@ -382,19 +382,19 @@ class Simulator:
             rule = f"at most {LARGEST_GRAVITY:g} in size, ten times the earth's"
             require(math.hypot(*scene.gravity) <= LARGEST_GRAVITY, "gravity", rule, scene.gravity)
         else:
-            rule = f"the weights' {info.gravity}, which a network of absolute inputs cannot take from a scene"
-            remedy = "take weights of relative inputs, as mechanics, or train some on scenes with this gravity"
+            rule = f"the weights' {info.gravity}, because a network with absolute inputs has no gravity as input"
+            remedy = "take weights with relative inputs, such as mechanics, or train on scenes with this gravity"
             same = math.dist(scene.gravity, info.gravity) <= SAME_GRAVITY * math.hypot(*info.gravity)
             require(same, "gravity", rule, scene.gravity, remedy=remedy)
         if info.network.obstacle_features:
-            rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
+            rule = f"the weights' {info.obstacle_cell_size}, the size of the obstacle cells in their data"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
 
 
 def initial_states(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
     """Returns the initial states of a list of scenes. Raises: ConfigError for another type, and for none."""
     example = "as in rollout([scene], frames)"
-    require(isinstance(scenes, Iterable), "scenes", "a list of them", type(scenes).__name__, remedy=example)
+    require(isinstance(scenes, Iterable), "scenes", "a list of scenes", type(scenes).__name__, remedy=example)
     states = [InitialState.of(scene) for scene in scenes]
     require(len(states) > 0, "scenes", "at least one", 0)
     return states

@@ -66,7 +66,7 @@ def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector
 
 def barrier_of_pieces(corner_F33: np.ndarray, cell_size: float, clearance: float) -> Barrier:
     """Returns the barrier of `barrier_pieces`: row f is triangle f. Raises: ConfigError for an invalid clearance."""
-    require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0, up to a cell ({cell_size:g})", clearance)
+    require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0 and at most a cell ({cell_size:g})", clearance)
     row_F24, cell_size = _rows(corner_F33, clearance), CELLS * cell_size
     cell_Q3, start_Q, triangle_E = _lists(row_F24, cell_size, clearance)
     return Barrier(

@@ -54,7 +54,7 @@ class Episode:
     """A trajectory. Frame 0 is the initial state, so T frames are T - 1 steps of 1 / frame_rate_hz seconds.
 
     Raises: ConfigError for a wrong shape, type or value. `encode_episode` and `decode_episode` check that positions
-    are finite; the class does not, because that takes long and verified files need it once.
+    are finite; the class does not, because the check is slow and verified files need it only once.
     """
 
     key: str  # sample name inside the data set, without dots: train-000012
@@ -107,7 +107,7 @@ class Episode:
         step_K3 = np.diff(cell_K3.astype(np.int64), axis=0)
         first_K = np.take_along_axis(step_K3, (step_K3 != 0).argmax(axis=1)[:, None], axis=1)  # without a sort
         ordered = bool((first_K > 0).all())
-        require(ordered, f"{self.key}: obstacle_cell", "sorted, each there once", f"{len(cell_K3)} cells")
+        require(ordered, f"{self.key}: obstacle_cell", "sorted and unique", f"{len(cell_K3)} cells")
         least = min((*self.wall_friction, *arrays.get("obstacle_friction", ())))
         require(least >= 0, f"{self.key}: friction", "at least 0", least)
 
@@ -276,7 +276,7 @@ def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: in
         raise ConfigError(f"{name} must have {dimensions} dimensions, got shape {shape}")
     start, size = head.tell(), math.prod(shape) * stored.itemsize
     if len(raw) - start != size:
-        raise ConfigError(f"{name} must hold {size} bytes for shape {shape}, got {len(raw) - start}")
+        raise ConfigError(f"{name} must have {size} bytes for shape {shape}, got {len(raw) - start}")
     try:
         return raw[start:].view(stored).reshape(shape)
     except ValueError as error:  # one length is 0 and another is too large

@@ -72,7 +72,7 @@ def field_of_episode(episode: Episode) -> ObstacleGrid:
 
 @lru_cache(maxsize=256)
 def _field(grid: ObstacleGrid, specification: str, domain_size: Vector) -> ObstacleGrid:
-    """Does not take the episode, because the cache would keep its positions in memory."""
+    """Takes no episode, because the cache would keep its positions in memory."""
     return field_around(grid, corners_at_rest(json.loads(specification)), domain_size)
 
 

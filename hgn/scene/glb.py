@@ -43,7 +43,7 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"it requires {', '.join(unknown)}, which is not read; export it without")
     least = tree.get("asset", {}).get("minVersion", "2.0")
     if least != "2.0":
-        raise ValueError(f"it needs glTF {least}, but 2.0 is read; export it as glTF 2.0")
+        raise ValueError(f"it needs glTF {least}, but only 2.0 is supported; export it as glTF 2.0")
     claims = Claims(path)
     file = _File(tree, binary, path.parent, claims)
     vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
@@ -78,7 +78,7 @@ class _Entries(list[Any]):
 
     def __getitem__(self, index: Any) -> Any:
         if index < 0:
-            raise IndexError(f"an entry has the number {index}")
+            raise IndexError(f"an entry has the index {index}")
         return super().__getitem__(index)
 
 
@@ -135,7 +135,7 @@ class _File:
             self.claims.add("primitives", LEAST_BYTES)
             mode, has = primitive.get("mode", TRIANGLES), f"primitive {number} of mesh {mesh} has"
             if mode not in range(FAN + 1):
-                raise ValueError(f"{has} mode {mode}, which is none of 0 to {FAN}")
+                raise ValueError(f"{has} mode {mode}, which is not from 0 to {FAN}")
             if mode < TRIANGLES:
                 continue
             if "POSITION" not in primitive.get("attributes", {}):
@@ -150,7 +150,7 @@ class _File:
             else:
                 index = np.arange(len(position_V3))
             if index.max(initial=-1) >= len(position_V3):
-                raise ValueError(f"vertex {index.max()} of a primitive with {len(position_V3)}")
+                raise ValueError(f"vertex {index.max()} of a primitive with {len(position_V3)} vertices")
             if mode == TRIANGLES:
                 triangle_F3 = index.reshape(-1, 3)
             elif mode == STRIP:
@@ -219,7 +219,7 @@ class _File:
             raise ValueError(f"buffer {index} must have a uri of at most {MOST_CHARACTERS:,} characters")
         path = (self.folder / unquote(uri)).resolve()
         if not (path.is_file() and path.is_relative_to(self.folder)):
-            raise FileNotFoundError(f"it names {uri!r}, which is no file in its folder")
+            raise FileNotFoundError(f"it names {uri!r}, which is not a file in its folder")
         return self.read(path)
 
 

@@ -61,15 +61,15 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
             raise ConfigError(f"{path}: {group.name} must contain its data itself, got a link in {name}")
         item = group[name]
         if (address := h5py.h5o.get_info(item.id).addr) in visited:
-            raise ConfigError(f"{path}: {group.name} must contain its data itself, got another name, {name}, for it")
+            raise ConfigError(f"{path}: {group.name} must contain its data itself, got a second name, {name}, for it")
         visited.add(address)
         if isinstance(item, h5py.Group):
             _require_own_data(item, path, claims, visited, depth + 1)
         elif isinstance(item, h5py.Dataset):
             if item.external or item.is_virtual:
-                raise ConfigError(f"{path}: {item.name} must lie in the file itself, got data of another file")
+                raise ConfigError(f"{path}: {item.name} must be stored in the file itself, got data in another file")
             if item.dtype.hasobject and item.size != 1:
-                raise ConfigError(f"{path}: {item.name} must be numbers, got texts of variable length")
+                raise ConfigError(f"{path}: {item.name} must be numbers, got strings of variable length")
             if item.dtype.kind == "c":
                 raise ConfigError(f"{path}: {item.name} must be real numbers, got {item.dtype}")
             chunk, shape = item.chunks or (), item.shape or ()

@@ -68,20 +68,20 @@ def require_kinds(scene: Any) -> None:
     """Checks the kinds of a SceneConfig, and that the settings which kinds draw are defaults. Raises: ConfigError."""
     for kind, share in scene.kinds.items():
         require(kind in SCENE_KINDS, "kinds", f"of {', '.join(SCENE_KINDS)}", kind)
-        require(0 <= share < math.inf, f"kinds.{kind}", "a finite share >= 0", share)
+        require(0 <= share < math.inf, f"kinds.{kind}", "a finite number >= 0", share)
     if not scene.kinds:
         return
-    require(sum(scene.kinds.values()) > 0, "kinds", "shares of which one is above 0", scene.kinds)
+    require(sum(scene.kinds.values()) > 0, "kinds", "numbers with at least one above 0", scene.kinds)
     for item in fields(scene):
         value = getattr(scene, item.name)
-        rule = f"its default ({item.default}) where kinds are given"
+        rule = f"its default ({item.default}) if kinds are given"
         require(item.name in FREE or value == item.default, item.name, rule, value, "kinds draw it")
 
 
 def require_funnel(scene: Any) -> None:
     """Checks that funnels of a SceneConfig fit into its domain. Raises: ConfigError."""
     if scene.funnel_scene_fraction > 0:
-        remedy, where = "or set funnel_scene_fraction=0", "where funnel_scene_fraction is above 0"
+        remedy, where = "or set funnel_scene_fraction=0", "if funnel_scene_fraction is above 0"
         require(scene.obstacle_count >= 4, "obstacle_count", f"at least 4 {where}", scene.obstacle_count, remedy)
         widest, height = FUNNEL_SQUARES[0] * scene.obstacle_size[1], min(scene.domain_size) / sum(FUNNEL_HEIGHT)
         rule = f"at most {FUNNEL_SQUARES[0]:g} of the largest obstacle_size ({widest:g}) {where}"

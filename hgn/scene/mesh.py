@@ -86,7 +86,7 @@ def load_bodies(
         raise ConfigError(f"{field} must stay within {limit:.1e} after scaling, got more for {path}; lower scale")
     closed_F, flip_F = _bodies(vertex_V3, triangle_F3)
     rounded_V3 = round_to_float32(placed)
-    if not closed_F.all():  # check again: corners that should be equal may differ in their last digits
+    if not closed_F.all():  # checked again after a join, because equal corners may differ in their last digits
         joined_V3 = _joined(rounded_V3, triangle_F3[~closed_F])
         also_F, other_F = _bodies(joined_V3, triangle_F3)
         used = triangle_F3[also_F & ~closed_F]
@@ -101,7 +101,7 @@ def load_bodies(
     if not parts:
         raise ConfigError(
             f"{field} must have a triangle with an area, got only zero-area triangles in {path}; "
-            "raise scale or mend the mesh"
+            "raise scale or repair the mesh"
         )
     return tuple(parts)
 
@@ -113,7 +113,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         remedy = "convert the mesh" if path.is_file() else near_file(path) or "convert the mesh"
         raise ConfigError(f"{field} must end in one of {endings}, got {path}; {remedy}")
     if not path.is_file():
-        remedy = near_file(path) or f"there is none at {path.absolute()}"
+        remedy = near_file(path) or f"there is no file at {path.absolute()}"
         raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
     try:
         vertex, triangle = read_glb(path) if path.suffix.lower() == ".glb" else _read_polygons(path)
@@ -127,7 +127,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         raise ConfigError(f"{field} must contain triangles, got none in {path}; export the surface, not points")
     if triangle.min() < 0 or triangle.max() >= len(vertex):
         raise ConfigError(
-            f"{field} must have triangles of its {len(vertex)} vertices, got vertices {triangle.min()} to "
+            f"{field} must have triangles whose indices are below {len(vertex)}, its vertices, got {triangle.min()} to "
             f"{triangle.max()} in {path}; export the mesh again"
         )
     return vertex, triangle
@@ -161,7 +161,7 @@ def _corners_of_stl(data: bytes) -> np.ndarray:
     if b"endsolid" not in text.lower():
         raise ValueError("it ends before endsolid")
     if part := _PART_OF_FACET.search(_FACET.sub(b"\n", text)):
-        raise ValueError(f"it has a facet that is not whole: {part[0].decode('utf-8', 'replace').strip()[:80]}")
+        raise ValueError(f"it has an incomplete facet: {part[0].decode('utf-8', 'replace').strip()[:80]}")
     return np.array(number_words(b" ".join(_FACET.findall(text)).lower().replace(b"vertex", b"")), np.float64)
 
 

@@ -34,7 +34,7 @@ class _Type:
 
     def __init__(self, name: str, *_: Any) -> None:
         if _PLAIN_TYPE.fullmatch(name) is None:
-            raise pickle.UnpicklingError(f"the type {name!r}, which is no number")
+            raise pickle.UnpicklingError(f"the type {name!r}, which is not a number")
         self.plain = np.dtype(name)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -62,10 +62,10 @@ class _ArraysAlone(pickle.Unpickler):
             return _empty_array if name == "_reconstruct" else _scalar
         if module == "numpy" and name in ("ndarray", "dtype"):
             return _Type if name == "dtype" else name  # every array becomes an _Array
-        raise pickle.UnpicklingError(f"{module}.{name}, which is no part of an array")
+        raise pickle.UnpicklingError(f"{module}.{name}, which is not part of an array")
 
     def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError(f"a reference to an object outside ({pid!r})")
+        raise pickle.UnpicklingError(f"a reference to an external object ({pid!r})")
 
 
 def _empty_array(*_: Any) -> _Array:
@@ -87,7 +87,7 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
             claims, folders = Claims(str(path), _size(archive)), dict[str, int]()
             for info in archive.infolist():
                 if archive.getinfo(info.filename) is not info:
-                    raise ConfigError(f"{path}: {info.filename.removesuffix('.npy')} must be there once, got two of it")
+                    raise ConfigError(f"{path}: {info.filename.removesuffix('.npy')} must appear once, got two of it")
                 claims.add(info.filename, info.file_size)
                 folders.setdefault(info.filename.rpartition("/")[0] or info.filename, len(folders))
             # sorted, so that the members of a folder follow one another
@@ -98,7 +98,7 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
                     raise ConfigError(f"{path}: {member} must be an array (.npy), as numpy.savez writes it")
                 yield member, _read_array(archive.read(info), f"{path}: {member}", objects)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
-        raise ConfigError(f"{path} must be a whole NumPy archive, got {error}; fetch it again") from None
+        raise ConfigError(f"{path} must be a complete NumPy archive, got {error}; fetch it again") from None
 
 
 def read_header(
@@ -138,7 +138,7 @@ def _read_array(data: bytes, name: str, objects: bool) -> np.ndarray:
         require_plain_pickle(data[file.tell() :])
         array = _ArraysAlone(file).load()
     except _ERRORS as error:
-        raise ConfigError(f"{name} must be an array, or a pickle of arrays alone, got {error}") from None
+        raise ConfigError(f"{name} must be an array, or a pickle of arrays only, got {error}") from None
     if not isinstance(array, np.ndarray) or array.shape != shape:
         raise ConfigError(f"{name} must be an array of shape {shape}, got {type(array).__name__}")
     return array.view(np.ndarray)

@@ -38,6 +38,6 @@ def read_particles(path: Path, field: str, material: str, domain_size: Vector) -
         require(bool(np.isfinite(value).all()), f"{field}: {name}", "finite", float("nan"))
     position_N3 = arrays["position"]
     outside = int(((position_N3 < 0) | (position_N3 > np.array(domain_size))).any(axis=1).sum())
-    require(len(position_N3) > 0, f"{field}: position", "of one particle or more", "none")
+    require(len(position_N3) > 0, f"{field}: position", "of at least one particle", "none")
     require(outside == 0, f"{field}: position", "inside the domain", f"{outside} outside")
     return position_N3, arrays.get("velocity", np.zeros_like(position_N3))

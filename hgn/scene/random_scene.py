@@ -118,7 +118,7 @@ def _place_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator
             hole_3 = first_3 + span_3 * rng.random(3)
             return _PlacedFunnel(funnel, hole_3), _squares(funnel, hole_3)
     raise _NoRoomError(
-        f"funnel_scene_fraction must be 0 where none of {FUNNELS} drawn funnels fits into the domain, got "
+        f"funnel_scene_fraction must be 0 if none of {FUNNELS} drawn funnels fits into the domain, got "
         f"{config.funnel_scene_fraction:g}; lower it, obstacle_size or group_size, or raise domain_size"
     )
 

@@ -391,7 +391,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     claims.add("frames x particles", *shape[:2], 13)
     shown_TP = np.concatenate([np.zeros(vertices, np.int64), entry_N]) <= np.arange(shape[0])[:, None]
     if points.shape != (shown_TP.sum(), 3) or (count_T != shown_TP.sum(axis=1)).any():
-        raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
+        raise ConfigError(f"Points must contain {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
     position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
     with np.errstate(over="ignore"):  # infinite places of particles are refused
         position_TP3[shown_TP] = points[()]

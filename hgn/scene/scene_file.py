@@ -81,14 +81,14 @@ class ObstacleEntry:
         require_bounds(self)
         if (self.mesh is None) == (self.shape is None):
             seen = "neither" if self.mesh is None else "both"
-            raise ConfigError(f"mesh or shape must be given, one of the two, got {seen}")
+            raise ConfigError(f"mesh or shape must be given, not both, got {seen}")
         if self.mesh is not None:
-            require(self.size is None, "size", "left out beside mesh", self.size, "meshes take scale")
+            require(self.size is None, "size", "left out with mesh", self.size, "meshes take scale")
         else:
             require(self.shape in OBSTACLE_SHAPES, "shape", f"one of {', '.join(OBSTACLE_SHAPES)}", self.shape)
-            require(self.scale is None, "scale", "left out beside shape", self.scale, "shapes take size")
-            require(self.size is not None, "size", "given beside shape", self.size)
-            require(self.position is not None, "position", "given beside shape", self.position)
+            require(self.scale is None, "scale", "left out with shape", self.scale, "shapes take size")
+            require(self.size is not None, "size", "given with shape", self.size)
+            require(self.position is not None, "position", "given with shape", self.position)
         _ = self.motion  # checks the keyframes
 
     @functools.cached_property
@@ -145,10 +145,10 @@ class GroupEntry(MaterialEntry):
         super().__post_init__()
         given = [name for name in ("shape", "size", "position") if getattr(self, name) is not None]
         if self.particles is not None:
-            require(not given, given[0] if given else "", "left out beside particles", "one")
+            require(not given, given[0] if given else "", "left out with particles", "one")
             return
         for name in ("shape", "size", "position"):
-            require(name in given, name, "given", None, "or particles, a file of them")
+            require(name in given, name, "given", None, "or give particles, a file")
         require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
         rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
         require(isinstance(self.size, tuple) == (self.shape == "box"), "size", rule, self.size)
@@ -277,7 +277,7 @@ def notes_on_files(scene: Scene) -> list[str]:
     notes = []
     entries = scene.specification["obstacles"]
     for sheet in scene.obstacles[len(entries) :]:
-        notes.append(f"{len(sheet.triangle_F3)} triangles are a sheet, because they enclose nothing: {sheet.name}")
+        notes.append(f"{len(sheet.triangle_F3)} triangles are a sheet, because they enclose no volume: {sheet.name}")
     first = 0
     for group, count in zip(scene.specification["groups"], scene.specification["particle_counts"], strict=False):
         position_N3, first = scene.position_N3[first : first + count], first + count

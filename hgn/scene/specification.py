@@ -1,4 +1,4 @@
-"""Checks the parts of a stored scene's specification that programs read: any JSON may be in a file of a stranger."""
+"""Checks the parts of a stored scene's specification that programs read, because untrusted files have any JSON."""
 
 import math
 from collections.abc import Mapping

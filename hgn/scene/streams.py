@@ -1,4 +1,4 @@
-"""Random streams of a scene: each kind of draw has its own, so it does not depend on the others and changes none."""
+"""Random streams of a scene. Each kind of draw has its own stream, so draws of different kinds are independent."""
 
 from enum import IntEnum, unique
 

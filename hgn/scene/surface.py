@@ -134,7 +134,7 @@ def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
     if len(point) == 0:
         return np.zeros(0, np.int64)
     crowd = np.unique(_cells(point, spacing), return_counts=True)[1]
-    if (crowd.astype(np.float64) ** 2).sum() > MOST_PAIRS:  # the first half, and what of the second is free of it
+    if (crowd.astype(np.float64) ** 2).sum() > MOST_PAIRS:  # the halves in turn
         half = len(point) // 2
         first = _spread_out(point[:half], spacing)
         near = point_tree(point[first]).query(point[half:], distance_upper_bound=np.nextafter(spacing, np.inf))[0]

@@ -26,7 +26,7 @@ PIECE_CELLS = 2.0  # longest edge of a piece of a triangle, in cells
 POINTS_PER_CELL = 2  # number of points along an edge of one cell
 CANDIDATES = 4  # number of points nearest to a centre whose triangles are measured
 LEAF_POINTS = 64  # number of points in a leaf of the tree; queries take half the time that they take with SciPy's 16
-INWARD = 0.05  # by so much of the way to the other corners points move inward, so that each belongs to one triangle
+INWARD = 0.05  # fraction by which points move towards the other corners, so that each belongs to one triangle
 ON_SURFACE = 1e-6  # distance of a centre, in cells, below which n is the normal of the triangle
 
 

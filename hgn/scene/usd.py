@@ -44,6 +44,6 @@ def _read(content: str, path: Path, *more: str) -> dict[str, np.ndarray]:
     if done.returncode == 3:
         raise ValueError(f"it {last}")
     if done.returncode:
-        rule = "it is damaged, or needs more memory or time than a file of its size does"
+        rule = "it is damaged, or needs more memory or time than files of its size"
         raise ValueError(f"{rule}: {last[:200]}" if last else rule)
     return dict(read_npz(io.BytesIO(done.stdout)))

@@ -1,7 +1,7 @@
 """Reads a USD file in a process of its own, which hgn.scene.usd starts, because pxr trusts the sizes in a file.
 
 `usd_program.py meshes FILE BYTES` or `particles FILE BYTES MATERIAL` writes arrays as npz to the standard output. It
-ends with code 3 and one line about content that is not read. It needs only NumPy and pxr.
+ends with code 3 and one line about unsupported content. It needs only NumPy and pxr.
 Shape legend: V vertices, K polygons, I corners of polygons, N particles.
 """
 
@@ -72,7 +72,7 @@ def array(prim: Any, name: str, empty: np.ndarray, room: list[int]) -> np.ndarra
     result = given.astype(empty.dtype)
     room[0] -= result.nbytes
     if room[0] < 0:
-        refuse("needs more memory than a file of its size does; export less, or write it without instances")
+        refuse("needs more memory than files of its size; export less, or write it without instances")
     return result
 
 

@@ -445,6 +445,5 @@ def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConf
         new.config = replace(config, kinds={}, domain_size=new.domain)
         return kind, new
     raise ConfigError(
-        f"kinds must be of scenes that fit into domain_size {list(config.domain_size)}, got {kind}; raise domain_size "
-        f"or leave {kind} out"
+        f"kinds must fit into domain_size {list(config.domain_size)}, got {kind}; raise domain_size or leave {kind} out"
     )

@@ -245,7 +245,7 @@ def _outside_obstacles(
     """Stops the straight path of a frame at up to SURFACES triangles in turn, with walls again after each shift.
 
     Each triangle shifts the end along its normal. If that normal points back across the plane of the previous shift,
-    the end moves along that plane instead. Otherwise a path in a gutter would alternate between the two planes.
+    the end moves along that plane instead. Otherwise a path in a groove would alternate between the two planes.
     """
     before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
     lost_N1 = ~within_range(position_N3, domain_N3).all(-1, keepdim=True)
@@ -269,7 +269,7 @@ def _outside_obstacles(
 def _outside_moving(
     state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
 ) -> torch.Tensor:
-    """Stops the paths of a frame at moving obstacles, in coordinates that move with each, by its poses at both ends."""
+    """Stops the paths of a frame at moving obstacles, in coordinates that move with each between its two poses."""
     assert state.moving is not None
     lost_N1 = ~within_range(position_N3, state.domain_S3[state.scene_N]).all(-1, keepdim=True)
     end_N3, step = torch.where(lost_N1, state.position_N3, position_N3), replace(step, wall_clearance=None)

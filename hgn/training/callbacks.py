@@ -62,7 +62,7 @@ class SameWeights(Callback):
         if not trainer.strategy.reduce_boolean_decision(mine == first, all=True):
             raise ConfigError(
                 f"run must be a folder that all machines share, got another checkpoint on some of them (rank "
-                f"{trainer.global_rank}: {mine}, rank 0: {first}); give them one run=FOLDER"
+                f"{trainer.global_rank}: {mine}, rank 0: {first}); set the same run=FOLDER on all"
             )
         # A rank that read the statistics of a growing data set later than rank 0 may have other values.
         for tensor in (*pl_module.parameters(), *pl_module.buffers()):
@@ -75,8 +75,8 @@ class SameWeights(Callback):
             return
         if not same_on_all_ranks(checksum(pl_module.parameters())):
             raise ConfigError(
-                f"weights must be the same on all ranks, got others at update {update}: a device or a "
-                "link computes wrongly; find it, and run the same command again to resume from rank 0's last checkpoint"
+                f"weights must be the same on all ranks, got others at update {update}: a device or a link is faulty; "
+                "replace it, and run the same command again to resume from rank 0's last checkpoint"
             )
 
 

@@ -111,7 +111,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
                 if record.filename.lower().endswith("/data.pkl"):  # torch ignores the case of names
                     require_plain_pickle(records.read(record), _CALLED)
             if (damaged := records.testzip()) is not None:
-                raise zlib.error(f"{damaged} has another CRC")
+                raise zlib.error(f"{damaged} has a wrong CRC")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         require_few_items(checkpoint)
     except FileNotFoundError:
@@ -124,13 +124,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
     except Exception as error:  # torch raises any kind of error for damaged files
         reason = str(error).strip().split("\n")[0]
-        raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from error
+        raise DamagedError(f"checkpoint must be a complete checkpoint file, got {path}: {reason}") from error
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     plain = isinstance(state, dict) and all(
         isinstance(name, str) and isinstance(tensor, torch.Tensor) for name, tensor in state.items()
     )
     if not plain or not isinstance(checkpoint.get(SECTION), dict):
-        raise ConfigError(f"checkpoint must be one of python -m hgn.train, got {path}")
+        raise ConfigError(f"checkpoint must be a file of python -m hgn.train, got {path}")
     return checkpoint
 
 
@@ -154,7 +154,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
 
     Raises: ConfigError naming the first key that differs.
     """
-    remedy = "set it so, or choose another run=FOLDER"
+    remedy = "use that value, or choose another run=FOLDER"
     # NetworkConfig and StepConfig add the defaults of keys that the checkpoint does not have.
     stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
     pairs = _pairs("network", stored, config.network) + _pairs("step", _step_config(checkpoint), config.step)
@@ -163,7 +163,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     _require_equal(pairs, f" to resume {path}", remedy)
     if data.config_hash != config_hash:
         raise ConfigError(
-            f"dataset.folder must hold the data set that {path} was trained on, got another one (config hash "
+            f"dataset.folder must contain the data set that {path} was trained on, got another one (config hash "
             f"{config_hash[:12]} instead of {data.config_hash[:12]}); {remedy}"
         )
 
@@ -195,7 +195,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
-    remedy = "set it so, or take other training.init_weights"
+    remedy = "use that value, or take other training.init_weights"
     theirs, ours = info.network, config.network
     same: dict[str, Any] = {}
     if theirs.relative and set(theirs.own_physics) <= set(ours.own_physics) and _begin(theirs, ours):
@@ -254,7 +254,7 @@ def _step_config(checkpoint: dict[str, Any]) -> StepConfig:
 
 
 def _other_version(path: Path, reason: str) -> str:
-    return f"checkpoint must hold a network as this version builds it, got {path}: {reason}; export it with its version"
+    return f"checkpoint must contain a network of this version, got {path}: {reason}; export it with its own version"
 
 
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:

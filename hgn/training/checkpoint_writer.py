@@ -100,8 +100,8 @@ def _write(checkpoint: dict[str, Any], path: Path) -> None:
 
 @contextmanager
 def _short_turns() -> Iterator[None]:
-    """Shortens Python's switch interval. Pickling keeps the interpreter lock, which the training needs after each
-    operation of torch. With the default interval the two would run almost one after the other."""
+    """Shortens Python's switch interval. Pickling holds the interpreter lock, which the training needs after each
+    operation of torch. With the default interval the two would run almost sequentially."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(TURN_S)
     try:

@@ -171,7 +171,7 @@ def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | N
     if order is not None and not trainer.strategy.reduce_boolean_decision(order == others, all=True):
         raise ConfigError(
             f"training.{', '.join(order or {})} must be the same on all ranks, got {order} on rank "
-            f"{trainer.global_rank} and {others} on rank 0: samples would come twice; start all with the same command"
+            f"{trainer.global_rank} and {others} on rank 0: samples would repeat; start all with the same command"
         )
     patience_s = standard_patience_s()
     deadline = time.monotonic() + patience_s

@@ -75,7 +75,7 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     seen = network.obstacle_features or scene.obstacle_count == 0
     require(seen, field, "without obstacles, which the network does not see", folder)
     upright = scene.gravity == config.scene.gravity and scene.upright
-    require(network.relative or upright, field, "of dataset's gravity where network.inputs=absolute", folder)
+    require(network.relative or upright, field, "of dataset's gravity with network.inputs=absolute", folder)
     differences = identity_differences(stored["mpm"], physics_settings(config.datagen), "mpm")
     require(not differences, field, "of the same physics", f"{folder}, where {'; '.join(differences[:3])}")
     reference, own = stored.get("reference"), config.datagen.reference
@@ -100,7 +100,7 @@ def wait_for_episodes(
     validation = min(max(needed - 1, 0 if others_validate else 1), config.dataset.validation_scenes)
     if generator is None and first_rank() and not EpisodeStore.available(folder):
         raise ConfigError(
-            f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
+            f"dataset.folder must contain a data set, got {folder} without one; generate it with python -m datagen "
             f"out={folder}, or set training.generate=true"
         )
     progress, seen_s = None, -math.inf
@@ -127,13 +127,13 @@ def wait_for_episodes(
             if not running:
                 generator.check()
                 raise ConfigError(
-                    f"training.minimum_episodes must be reachable, got {needed} where the data set has "
-                    f"{len(store) if store else 0}; ask for more scenes"
+                    f"training.minimum_episodes must be reachable, got {needed} for a data set of "
+                    f"{len(store) if store else 0}; generate more scenes"
                 )
         elif first_rank() and (not is_remote(folder) or (store is not None and store.manifest.complete)):
             raise ConfigError(
-                f"dataset.folder must hold {needed} training episodes, got {len(store) if store else 0} in {folder}; "
-                "generate them, or set training.generate=true"
+                f"dataset.folder must contain {needed} training episodes, got {len(store) if store else 0} in "
+                f"{folder}; generate them, or set training.generate=true"
             )
         if progress is None and first_rank():
             text = f"waiting for {needed} training and {awaited} validation episodes in {folder}"
@@ -168,7 +168,7 @@ def estimate(config: TrainConfig, frames: int, seconds: float) -> str:
     size = scenes * sum(path.stat().st_size for path in folder.glob("*-*.tar")) / present
     left_s = max(0.0, scenes * config.dataset.frames / frames - 1) * seconds
     space = f"{size / 1e9:.2g} GB in all, {disk_usage(folder).free / 1e9:.2g} GB are free"
-    return f"about {duration(left_s)} for the rest of {scenes} scenes, while training goes on; {space}"
+    return f"about {duration(left_s)} for the rest of {scenes} scenes, while training continues; {space}"
 
 
 class PublishedEpisodes:

@@ -60,7 +60,7 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
     if devices != launched[0]:
         # each process would train on its own and overwrite the others' checkpoints, or wait forever
         raise ConfigError(
-            f"training.devices must be the {launched[0]} processes that the launcher started on each of {launched[1]} "
+            f"training.devices must be {launched[0]}, the processes that the launcher started on each of {launched[1]} "
             f"machines, got {devices}; leave it out, and under Slurm start one task for each device with srun"
         )
     return launched
@@ -101,7 +101,7 @@ def same_on_all_ranks(number: torch.Tensor) -> bool:
 
 
 def _check_numbers() -> None:
-    """Refuses launchers' variables that are no numbers, and ranks that do not exist."""
+    """Refuses launchers' variables that are not numbers, and ranks that do not exist."""
     for name in (*_RANKS, *_COUNTS):
         given, count = os.environ.get(name, "0" if name in _RANKS else "1"), os.environ.get(_RANKS.get(name, ""), "")
         least, most = int(name in _COUNTS), int(count) - 1 if count.isdecimal() else 1 << 30
@@ -114,7 +114,7 @@ def _check_restarts() -> None:
     if shared and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
         # Restarted processes would read the addresses of processes that have ended, and wait for half an hour.
         name, restarts = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE", os.environ["TORCHELASTIC_MAX_RESTARTS"]
-        rule = f"1 in torchrun's environment where it may restart processes (--max-restarts {restarts})"
+        rule = f"1 in torchrun's environment if it may restart processes (--max-restarts {restarts})"
         raise ConfigError(f"{name} must be {rule}, got {os.environ.get(name, 'nothing')}; see pytorch issue 135712")
 
 
@@ -157,13 +157,13 @@ def _check_launcher() -> None:
         missing = [name for name in needed if not os.environ.get(name)]
         if missing and os.environ.get("WORLD_SIZE") != "1":
             raise ConfigError(
-                f"{' and '.join(missing[:2])} must be set where RANK is, got RANK={os.environ['RANK']} without; "
+                f"{' and '.join(missing[:2])} must be set with RANK, got only RANK={os.environ['RANK']}; "
                 "start with torchrun, or unset RANK for one process"
             )
     elif _inside_slurm_step() and not started_by_srun() and os.environ["SLURM_NTASKS"] != "1":
         raise ConfigError(
             f"training must be started with srun in a job of {os.environ['SLURM_NTASKS']} tasks, got one "
-            "process without; as in srun python -m hgn.train, or sbatch --ntasks=1"
+            "process without; for example srun python -m hgn.train, or sbatch --ntasks=1"
         )
     elif not started_by_srun():
         for name, single in _SINGLE.items():  # each process would train alone

@@ -49,8 +49,8 @@ def take_counters(counters: torch.Tensor, update: int) -> tuple[int, dict[str, f
     counters[4] = 0
     if most_in_a_row >= MAXIMUM_SKIPPED:
         raise ConfigError(
-            f"gradients must be finite, got {most_in_a_row:.0f} updates in a row without, up to update {update}; "
-            "the weights are as before them: lower training.learning_rate or look for damaged episodes, and go on "
+            f"gradients must be finite, got others in {most_in_a_row:.0f} updates in a row, up to update {update}, "
+            "which did not change the weights; lower training.learning_rate or look for damaged episodes, and resume "
             "from the last checkpoint"
         )
     return int(skipped), {"gradient_norm": norm_sum / finite} if finite else {}

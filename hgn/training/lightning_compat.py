@@ -128,8 +128,8 @@ def name_odd_parts(trainer: Trainer, path: Path) -> None:
                     raise
                 cause = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
                 raise ConfigError(
-                    f"checkpoint must hold the state of a training as this version writes it, got {path}: {cause}; "
-                    "delete it to resume from the one before"
+                    f"checkpoint must contain the state of a training of this version, got {path}: {cause}; "
+                    "delete it to resume from the previous one"
                 ) from error
 
         return call

@@ -27,7 +27,7 @@ Builder = Callable[[Path, dict[str, Any]], Logger]
 
 
 def _wandb(run: Path, settings: dict[str, Any]) -> Logger:
-    # otherwise a process whose server is away would never end
+    # otherwise a process whose server is unreachable would never end
     os.environ.setdefault("WANDB_FINISH_TIMEOUT", f"{standard_patience_s():.0f}")
     name = None if "WANDB_NAME" in os.environ else run.name
     project, run_id = os.environ.get("WANDB_PROJECT", PROJECT), _stored_id(run, "wandb", "WANDB_RUN_ID")
@@ -96,7 +96,7 @@ class ThreadedLogger(TrainerLogger):
         try:
             self._calls.put_nowait(function)
         except queue.Full:
-            self._report(f"{MOST_WAITING} calls wait for it, and later ones are dropped")
+            self._report(f"{MOST_WAITING} calls wait for it, later calls are dropped")
 
     def log_metrics(self, metrics: Any, step: int | None = None) -> None:
         self.call(lambda logger: logger.log_metrics(metrics, step))
@@ -131,4 +131,4 @@ class ThreadedLogger(TrainerLogger):
         if not self._reported:
             self._reported = True
             text = " ".join(str(fault).split()) or type(fault).__name__
-            print(printable(f"{self._kind} fails: {text}; training goes on, metrics.jsonl has it all"), file=sys.stderr)
+            print(printable(f"{self._kind} fails: {text}; training continues, see metrics.jsonl"), file=sys.stderr)

@@ -47,7 +47,7 @@ class TrainingModule(LightningModule):
         self.training_config, self.data, self.backend = training, data, backend
         self._precisions = precisions
         self.update = 0  # number of updates
-        # whether simulations between updates on backend torch shall end; only without other ranks, which do not know
+        # whether to end simulations between updates on backend torch; only without other ranks, which would not end
         self.stopped: Callable[[], bool] = lambda: False
         self.skipped = 0  # number of skipped updates at the last log line
         self.sampler_state = SamplerState()

@@ -80,8 +80,8 @@ class Monitor(Callback):
         if not trainer.strategy.reduce_boolean_decision(here, all=True):
             network.train()
             if trainer.is_global_zero:
-                text = "the scenes to measure on are not all here, and their server does not send them now"
-                print(f"nothing is measured at update {module.update}: {text}", file=sys.stderr)
+                text = "a server did not send all scenes that are measured"
+                print(f"no measurement at update {module.update}: {text}", file=sys.stderr)
             return
         scenes = {split: [store[i] for i in chosen[split]] for split, store in self.stores.items()}
         values: dict[str, float] = {}

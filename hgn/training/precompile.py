@@ -127,7 +127,7 @@ class Precompilation:
             return (
                 f"backend triton: {len(failed)} of {len(self._programs)} processes that compile kernels ahead failed "
                 f"(exit code {failed[0].exit_code}: {last_message(failed[0].output)}); "
-                "what is missing is compiled when it is first used"
+                "missing kernels are compiled at their first launch"
             )
         count = sum(int(last_message(program.output)) for program in self._programs)
         return f"backend triton: {count} kernels ready {seconds:.0f} s after the start"

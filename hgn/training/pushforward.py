@@ -75,7 +75,7 @@ def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts:
     long_enough = [i for i, count in enumerate(frame_counts) if count >= SIMULATED_FRAMES]
     if not long_enough:
         raise ConfigError(
-            f"training.pushforward_fraction must be 0 where no episode has {SIMULATED_FRAMES} frames, got "
+            f"training.pushforward_fraction must be 0 if no episode has {SIMULATED_FRAMES} frames, got "
             f"{training.pushforward_fraction:g} for episodes of up to {max(frame_counts, default=0)} frames"
         )
     generator = np.random.default_rng([training.seed, START_STREAM, update, rank])

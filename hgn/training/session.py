@@ -76,7 +76,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         print(text if devices * nodes == 1 else f"{text}, {devices * nodes} processes", file=sys.stderr)
         if not config.dataset.validation_scenes and not len(store.of_split("validation")):
             print(
-                f"no validation scenes: there will be no {BEST_NAME}, nor errors and pictures of them", file=sys.stderr
+                f"no validation scenes, so no {BEST_NAME}, validation errors or pictures are written", file=sys.stderr
             )
     keep_to_quota()
     set_matmul_precision(precisions[0])
@@ -225,7 +225,7 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], trained: 
         print(
             f"one-step validation MSE {last['one_step/validation']:.3e} on every fourth frame, "
             f"{format_ratio(last.get('baseline_ratio/validation', math.nan))} the best baseline's; few frames contain "
-            "most of the error, so hgn.evaluate, which measures all, may print another ratio"
+            "most of the error, so hgn.evaluate, which measures all frames, may print another ratio"
         )
     folder = Path(config.run) / "checkpoints"
     if not (folder / BEST_NAME).exists():

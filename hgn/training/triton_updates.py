@@ -127,7 +127,7 @@ class TritonUpdates:
         if self._ranks.count > 1:
             sum_over_ranks(failures)
         if failures > 0:
-            failure = failure or "the kernels compute wrongly on another rank, whose message has the error"
+            failure = failure or "the kernels failed the check on another rank, whose message contains the error"
             if not self._other_precisions:
                 raise ParityError(failure)
             precision, self._other_precisions = self._other_precisions[0], self._other_precisions[1:]
@@ -160,7 +160,7 @@ class TritonUpdates:
         parts.append(f"{updates.capture_seconds:.1f} s capturing {updates.captures} times")
         self._say(
             f"the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
-            f"in that {misses.seconds:.1f} s for {misses.count} kernels that were not compiled ahead"
+            f"including {misses.seconds:.1f} s for {misses.count} kernels that were not compiled ahead"
         )
 
     def _placed(self, episode: EpisodeTensors) -> DeviceEpisode:

@@ -103,7 +103,7 @@ class RankWatch(Callback):
             torch.distributed.distributed_c10d._abort_process_group()
 
     def _stop(self) -> None:
-        """No count is written afterwards."""
+        """Ends the writing of counts."""
         with self._writing:
             self._ended.set()
         signal.set_wakeup_fd(-1)

@@ -40,7 +40,7 @@ TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
 ABOUT = {
-    "mechanics": "any motion and gravity; a body alone flies exactly",
+    "mechanics": "any motion and gravity; free flight is exact",
     "own_physics": "pools, dams, slopes, small and large bodies; resting material creeps",
     "obstacles_small": "fast on a CPU; starts at rest, gravity 9.8 downwards; some particles float or pass obstacles",
 }
@@ -74,7 +74,7 @@ class PlayPage:
         self.stage = StageView(self.server, session.domain_size, spacing)
         self.ended, self.playing, self.steps = threading.Event(), True, 0
         self.diverged = False  # whether the page paused because the simulation diverged
-        self.limited = False  # whether viewers were told that this drag has reached the limit of particles
+        self.limited = False  # whether viewers were notified that this drag has reached the limit of particles
         self.actions: dict[object, tuple[Callable[[], Any], Any]] = {}
         self._queueing = threading.Lock()
         self.meshes: dict[int, viser.MeshHandle] = {}
@@ -257,7 +257,7 @@ class PlayPage:
         def _(event: Any) -> None:
             file = event.target.value
             if "upload" in self.actions:
-                self._notify("another mesh waits to be read; upload it again", event.client)
+                self._notify("another mesh is still being read; upload it again", event.client)
             else:
                 self.do(lambda: self._add_file(file.name, file.content), event.client, "upload")
 

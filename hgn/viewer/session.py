@@ -30,7 +30,7 @@ from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # least distance of an entering particle from all others, in spacings of particles at rest
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
-MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of files, including those of obstacles in past frames
+MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of mesh files, those of past frames included
 MOST_SAMPLES = 600_000  # surface samples of an added mesh: about 4 CPU seconds, in which the page stands still
 CHANGES = 100  # largest number of changes that can be undone
 FULL_SHARE = 0.5  # the spout waits while more than this fraction of the particles of one frame are still near it
@@ -340,7 +340,7 @@ class PlaySession:
 
         Raises ConfigError without particles, because a scene file needs at least one.
         """
-        require(len(self.newest.position_N3) > 0, "scene's particles", "more than none to be saved", 0, "pour some")
+        require(len(self.newest.position_N3) > 0, "scene's particles", "at least one to be saved", 0, "pour some")
         newest, rate = self.newest, self.simulator.frame_rate_hz
         groups, obstacles, files = [], [], {}
         for index, name in enumerate(MATERIALS):

@@ -48,7 +48,7 @@ class StageView:
         self.scene.set_up_direction("+y")
         self.middle_3 = 0.5 * np.array(domain_size)
         low_3, high_3 = np.zeros(3), np.array(domain_size)
-        # the box fills the height; it stands left of the middle, for the panel is at the right
+        # the box fills the height and is left of the middle, because the panel is at the right
         size, eye, target = max(domain_size), (0.86, 0.62, 2.0), (0.14, -0.04, -0.06)
         if dimensions == 2:
             low_3[2], high_3[2] = self.middle_3[2] - spacing, self.middle_3[2] + spacing

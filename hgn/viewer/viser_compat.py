@@ -196,7 +196,7 @@ def require_taken(client: viser.ClientHandle) -> None:
     """Raises ConfigError if an earlier file still waits to be sent to a viewer."""
     waiting = list(client._websock_connection.get_message_buffer().message_from_id.values())
     count = sum(isinstance(message, messages.FileTransferPart) for message in waiting)
-    require(count == 0, "download", "complete before the next", f"{count} parts that wait")
+    require(count == 0, "download", "complete before the next", f"{count} waiting parts")
 
 
 def stop_server(server: viser.ViserServer) -> None:

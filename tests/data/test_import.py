@@ -384,7 +384,7 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     assert result.dimensions == 2 and compare_picture(result, [0, 8]).height == drawn.height
     for scene, message in (
         ("funnel", "dimensions must be the network's 2, got 3; take weights of 3D data"),
-        (None, "data must be given with weights of imported data, which random scenes are not like"),
+        (None, "data must be given with weights of imported data, which differ from random scenes"),
     ):
         with pytest.raises(ConfigError, match=message):
             rollout(RolloutConfig(str(weights), str(tmp_path / "out.vtkhdf"), scene=scene, frames=2, device="cpu"))

@@ -320,4 +320,4 @@ def test_faults_are_found(tmp_path, skipped):
     """Without the sync of files, or of folders, saved checkpoints are lost."""
     with mock.patch.object(files, skipped):
         _, _, faults = lose_power(SCENARIOS["checkpoints"], tmp_path, 1, 3)
-    assert any("was saved" in fault or "must be a whole checkpoint" in fault for fault in faults)
+    assert any("was saved" in fault or "must be a complete checkpoint" in fault for fault in faults)

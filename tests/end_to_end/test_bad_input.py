@@ -56,13 +56,13 @@ VALUES = [
     ("train", ["training.batchsize=2"], "training.batchsize is not a known key; did you mean batch_scenes?"),
     ("train", ["network.obstacle_features=false"], "network.obstacle_features must be true for scenes with obst"),
     ("train", ["network.materials=[lava]"], "network.materials must be all of scene.materials, got ['lava']"),
-    ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative where scene.kinds are given, or"),
+    ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative if scene.kinds are given, or"),
     (
         "train",
         ["+experiment=imported"],
         "import_trajectories, got 'data/imported'; run it with from=FOLDER out=data/min",
     ),
-    ("train", ["training=[1]"], "settings must be as Hydra reads them, got training=[1] (TypeError: "),
+    ("train", ["training=[1]"], "settings must follow Hydra's syntax, got training=[1] (TypeError: "),
     *(
         (command, [f"~{key}"], f"error: {key.partition('=')[0]} must be kept, got '~{key}'; leave it out, or")
         for command, key in (
@@ -105,7 +105,7 @@ VALUES = [
     ("export", ["checkpoint=run", "out=x"], "checkpoint must be an existing file, got run; take run/checkpoints/"),
     ("export", ["checkpoint=run/checkpoints/bst.ckpt", "out=x"], "bst.ckpt; did you mean best.ckpt?"),
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
-    ("export", ["out=x"], "checkpoint must be given, or else weights, got None"),
+    ("export", ["out=x"], "checkpoint must be given, or weights instead, got None"),
     ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
     ("rollout", ["--weights=mechanics"], "--weights=mechanics is not an option; settings are given as weights=mec"),
     ("train", ["--resume"], "--resume is not an option; settings are given as KEY=VALUE; --help shows the keys"),
@@ -121,7 +121,7 @@ VALUES = [
         "experiment must be a path of at most 4,095 bytes, 255 in each name, got 'a",
     ),
     *(
-        ("rollout", [*given, "seed=5"], "seed must be left out where scene or data is given, got 5; a scene file has i")
+        ("rollout", [*given, "seed=5"], "seed must be left out if scene or data is given, got 5; a scene file has i")
         for given in (["scene=scene.yaml"], ["data=data", "episode=validation-000000"])
     ),
     ("rollout", ["frame=3"], "frame is not a known key; did you mean frames?"),
@@ -174,8 +174,8 @@ FILES = [
     ("evaluate", EVALUATE, of("damage", "validation", alter), ": it was altered; delete it and run the generator agai"),
     ("evaluate", EVALUATE, of("damage", "validation", Path.unlink), " is listed in the index but missing; run the gen"),
     ("train", "other", of("damage", "train", truncate), " bytes, got "),
-    ("train", "run", CUT_RUN, "checkpoint must be a whole checkpoint file, got"),
-    ("export", OF_RUN, CUT_RUN, "checkpoint must be a whole checkpoint file, got"),
+    ("train", "run", CUT_RUN, "checkpoint must be a complete checkpoint file, got"),
+    ("export", OF_RUN, CUT_RUN, "checkpoint must be a complete checkpoint file, got"),
     ("export", EXPORT, of("checkpoint", dict.clear), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
     ("export", EXPORT, of("network", wings=2), "got foreign.ckpt: network.wings is not a known key; "),
     ("export", EXPORT, of("network", width=16), "got foreign.ckpt: checkpoint tensor "),
@@ -201,7 +201,7 @@ def test_diverging_weights(place, capsys, monkeypatch):
     place.accelerate(5.0)
     place.path("earlier").mkdir()
     place.path("earlier/rollout.vtkhdf").write_bytes(b"an earlier hgn rollout")
-    message = "weights must keep the simulation together, got weights.safetensors: the simulation diverged at frame 1:"
+    message = "weights must simulate without divergence, got weights.safetensors: the simulation diverged at frame 1:"
     check(place, "rollout", [*ROLLOUT, "out=earlier/rollout.vtkhdf"], message, capsys, monkeypatch)
 
 

@@ -148,7 +148,7 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
     file, scene = tmp_path / "still.safetensors", tmp_path / "fast.yaml"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, velocity: [3, 0, -4]}"
     scene.write_text(f"groups: [{group}]\n")
-    contact, flight = "collisions and contacts are a guess\n", "motion is a guess, and exact with weights=own_physics"
+    contact, flight = "collisions and contacts are unreliable\n", "motion is unreliable, but free flight is exact"
     for inputs, known, wanted in (
         ("relative", None, None), ("relative", 5.0, None), ("relative", 5 - 1e-6, None),
         ("relative", 3.0, f"up to 3; beyond that {contact}"), ("absolute", 5.0, None),
@@ -159,10 +159,10 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
         save_weights(file, silent(build_network(config)), info)
         given = {"weights": str(file), "frames": 2, "scene": str(scene), "out": str(tmp_path / "a.vtkhdf")}
         assert rollout.main(given) == 0
-        line = "velocity: groups begin with up to 5 domain units per second, those of the data of still with "
+        line = "velocity: groups start with up to 5 domain units per second, in the data of still with "
         said = capsys.readouterr().err
         assert f"{line}{wanted}" in said if wanted else line not in said
     scene.write_text(f"groups: [{group.replace('3, 0, -4', '1e38, 0, 1e38')}]\n")
     with pytest.raises(ConfigError, match="diverged at frame 1"):  # without a warning of NumPy
         rollout.main(given)
-    assert "groups begin with up to 1.41e+38 domain units" in capsys.readouterr().err
+    assert "groups start with up to 1.41e+38 domain units" in capsys.readouterr().err

@@ -237,7 +237,7 @@ def test_obstacles_that_are_none():
     nothing, flat = np.zeros((0, 3, 3)), np.array([[[0.2] * 3, [0.3] * 3, [0.4] * 3]])
     assert barriers_of(nothing, nothing) is None and barriers_of(flat) is None
     for clearance in (0.0, 0.02, float("nan")):
-        with pytest.raises(ConfigError, match=r"obstacle_clearance must be above 0, up to a cell \(0.015625\), got"):
+        with pytest.raises(ConfigError, match=r"obstacle_clearance must be above 0 and at most a cell \(0.015625\)"):
             build_barrier(square((0.5,) * 3, 0), CELL, clearance, DOMAIN)
 
 

@@ -141,7 +141,7 @@ def test_a_simulation_keeps_the_rest_shape():
     assert torch.equal(network(replace(plain, rest=none)), network(plain))
     with pytest.raises(ConfigError, match="material must be one of the network's"):
         Simulator(network_of(inputs="local"), 60.0, "torch").start([both])
-    with pytest.raises(ConfigError, match="materials must be with elastic where own_physics has it"):
+    with pytest.raises(ConfigError, match="materials must be a list with elastic if own_physics contains it"):
         NetworkConfig(inputs="local", own_physics=("elastic",))
     weights, training = load_weights(find_weights("mechanics"))[0], TrainingConfig(init_weights="mechanics")
     config = replace(weights.config, own_physics=OWN["own_physics"], materials=MATERIALS)

@@ -16,7 +16,7 @@ from hgn.runtime.triton_host import host_unsupported_reason
 from hgn.scene.material import MATERIALS, OWN_PHYSICS
 from hgn.schema import ConfigError
 
-GOLD, HALF = "it needs gold", "it has no fp16"
+GOLD, HALF = "it needs gold", "it does not support fp16"
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
 
 
@@ -28,7 +28,7 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda")
         ("auto", "tf32", (GOLD, None), ("torch", f"training backend: torch (not triton: {GOLD})")),
         ("triton", "tf32", (GOLD, None), "training.backend must be torch or auto here, got triton: it needs gold"),
         ("auto", "fp16", (GOLD, HALF), "precision must be tf32 or fp32 on backend torch, got fp16; triton: it"),
-        ("torch", "fp16", (None, HALF), "got fp16; training.backend=torch was asked for"),
+        ("torch", "fp16", (None, HALF), "got fp16; training.backend=torch was requested"),
     ],
 )
 def test_the_backend_is_chosen_and_said(backend, precision, reasons, expected):

@@ -216,7 +216,7 @@ def test_normals_turn_with_their_obstacle():
         *(({"poses": poses}, "poses must be a Pose by the number") for poses in ("x", [Pose()], {0: None})),
         ({"poses": {0.0: Pose()}}, "poses must be 0 to 1, got 0.0"),
         ({"smoothing": 1.5}, "smoothing must be 0 to 1 cells, got 1.5"),
-        ({"gravity_3": torch.zeros(3)}, "gravity_3 must be left out for a network of absolute inputs"),
+        ({"gravity_3": torch.zeros(3)}, "gravity_3 must be left out for a network with absolute inputs"),
         ({"position_N3": torch.zeros(3)}, r"position_N3 must be of shape \(12, 3\), got \(3,\)"),
         ({"poses": {2: Pose()}}, "poses must be 0 to 1, got 2"),
         ({"poses": {0: Pose(rotation_3=torch.zeros(1))}}, r"rotation_3 must be of shape \(3,\), got \(1,\)"),

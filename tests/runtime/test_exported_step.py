@@ -262,7 +262,7 @@ def test_onnx_runs_in_cpp(as_onnx):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "checkpoint must be given, or else weights, got None"),
+        ({}, "checkpoint must be given, or weights instead, got None"),
         ({"checkpoint": "a"}, "out must be given with checkpoint, got None"),
         ({"checkpoint": "a", "weights": "gns"}, "weights must be null with checkpoint, got 'gns'"),
         ({"weights": "gns"}, "out must be given with weights, or onnx, package or arrays, got None"),

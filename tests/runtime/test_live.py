@@ -190,7 +190,7 @@ def test_what_is_refused_changes_nothing():
         (lambda: live.add_particles(one_13, one_13, np.zeros(1)), "material_A must be whole numbers, got 'float64'"),
         (lambda: live.add_particles(one_13 * np.nan, one_13, which_1), "position_A3 must be finite, got nan"),
         (lambda: simulator.rollout(first, 3),
-         r"scenes must be a list of them, got 'InitialState'; as in rollout\(\[scene\], fr"),
+         r"scenes must be a list of scenes, got 'InitialState'; as in rollout\(\[scene\], fr"),
         (lambda: live.set_gravity((0.0, 0.0, 0.0)), "gravity must be the weights'"),
         (lambda: live.restore(np.zeros((21, 3), np.float32), np.zeros((21, 5, 3), np.float32), 0),
          "position_N3 must be at most 20 particles, got 21"),

@@ -43,7 +43,7 @@ def test_scenes_equal_each_alone(backend):
         before = paths(live, 1)
         assert list(live.ended) == [1] and live.ended[1].frame == 1 and "15 of 15" in live.ended[1].cause
         assert before[1].shape == (1, 0, 3) and live.particle_count == 35
-        with pytest.raises(ConfigError, match="index must be of a scene in progress, got 1; reset it"):
+        with pytest.raises(ConfigError, match="index must be the index of a scene in progress, got 1; reset it"):
             live.add_particles(first.position_N3, first.velocity_N3, first.material_N, index=1)
         for index, new, ended in ((2, scene(0, 3), [1]), (2, third, [1]), (1, second, [])):
             state = live.state
@@ -116,7 +116,7 @@ def test_what_is_refused_changes_nothing():
             (lambda: live.set_gravity((0.0, np.nan, 0.0)), "gravity must be three numbers"),
             (lambda: live.set_gravity((0.0, 10**400, 0.0)), "gravity must be three numbers"),
             (lambda: LiveSimulation(None, [first]), "simulator must be a Simulator, got 'NoneType'"),
-            (lambda: LiveSimulation(simulator, 3), "scenes must be a list of them, got 'int'"),
+            (lambda: LiveSimulation(simulator, 3), "scenes must be a list of scenes, got 'int'"),
             (lambda: LiveSimulation(simulator, [first], "x"), "capacity must be a whole number, got 'x'"),
             (lambda: setattr(live, "frame", 1.5), "frame must be a whole number, got 1.5"),
             (lambda: simulator.rollout([], 3), "scenes must be at least one, got 0"),

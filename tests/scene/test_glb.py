@@ -172,7 +172,7 @@ def test_buffers_elsewhere(tmp_path):
         if fits:
             assert len(load_mesh(path).triangle_F3) == 12
         else:
-            with pytest.raises(ConfigError, match="is no file in its folder"):
+            with pytest.raises(ConfigError, match="is not a file in its folder"):
                 load_mesh(path)
 
 
@@ -224,8 +224,8 @@ def test_glb_that_lies(tmp_path):
         (lambda tree: tree["accessors"][0].update(count=10**9), "readable GLB"),
         (lambda tree: tree["accessors"][0].update(count=4), "vertex 7 of a primitive with 4"),
         (lambda tree: tree["accessors"][0].update(byteOffset=-4), "readable GLB"),
-        (lambda tree: tree["nodes"][0].update(mesh=-1), "an entry has the number -1"),
-        (lambda tree: tree["nodes"].append({"children": [-1]}), "an entry has the number -1"),
+        (lambda tree: tree["nodes"][0].update(mesh=-1), "an entry has the index -1"),
+        (lambda tree: tree["nodes"].append({"children": [-1]}), "an entry has the index -1"),
         (lambda tree: tree["bufferViews"][0].update(byteOffset=10**12), "readable GLB"),
         *(
             (lambda tree, kind=kind, name=name, size=size: tree[kind][0].update({name: size}), "that are not whole")
@@ -241,7 +241,7 @@ def test_glb_that_lies(tmp_path):
         ),
         (lambda tree: tree["nodes"][0].update(skin=0), "node 0 has a skin"),
         (loop, "node 0 has two parents"),
-        (lambda tree: tree["asset"].update(minVersion="2.1"), "it needs glTF 2.1, but 2.0 is read"),
+        (lambda tree: tree["asset"].update(minVersion="2.1"), "it needs glTF 2.1, but only 2.0 is supported"),
         *((lambda tree, mode=mode: part(tree, mode=mode), "primitive 0 of mesh 0 has mode") for mode in (7, -1, "4")),
         (lambda tree: part(tree, attributes={}), "primitive 0 of mesh 0 has no POSITION"),
         *(

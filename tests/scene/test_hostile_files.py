@@ -149,7 +149,7 @@ def test_pickled_array_with_a_state_that_none_has():
         file = io.BytesIO()
         with zipfile.ZipFile(file, "w") as whole:
             whole.writestr("a.npy", content.replace(old, new))
-        with pytest.raises(ConfigError, match="a must be an array, or a pickle of arrays alone, got"):
+        with pytest.raises(ConfigError, match="a must be an array, or a pickle of arrays only, got"):
             list(read_npz(file, objects=True))
 
 
@@ -176,7 +176,7 @@ def checkpoint():
         ),
         (lambda _, archive: archive.writestr("a/DATA.PKL", b"\x80\x02ctorch\nTensor\n."), "torch Tensor, which is no"),
         (lambda _, archive: archive.writestr("a/b", b"x", zipfile.ZIP_BZIP2), "a/b is compressed"),
-        (lambda path, _: torch.save({"hgn": {}, "state_dict": {5: torch.zeros(1)}}, path), "must be one of python -m"),
+        (lambda path, _: torch.save({"hgn": {}, "state_dict": {5: torch.zeros(1)}}, path), "must be a file of python"),
     ],
 )
 def test_archives_that_torch_reads_otherwise(tmp_path, change, message):

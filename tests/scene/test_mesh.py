@@ -132,12 +132,12 @@ REFUSED = [
     ("a.stl", bytes(80) + struct.pack("<I", 3) + bytes(149), {}, "it has 233 of 234 bytes"),
     ("a.stl", b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", {}, "it ends before endsolid"),
     *(
-        ("a.stl", b"\n".join([b"solid", *FACETS[:first], *FACETS[last:], b"endsolid"]), {}, "that is not whole: f")
+        ("a.stl", b"\n".join([b"solid", *FACETS[:first], *FACETS[last:], b"endsolid"]), {}, "incomplete facet: f")
         for first, last in ((3, 7), (5, 7), (6, 7), (12, 14), (13, 14), (2, 3))
     ),
     ("a.glb", b"", {}, READABLE.format("GLB")),
     ("a.glb", b"glTFxxxxxx", {}, READABLE.format("GLB")),
-    ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, "ramp must have triangles of its 3 vertices, got vertices 0 to 8"),
+    ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, "ramp must have triangles whose indices are below 3, .*8"),
     ("a.obj", GOOD + b"f 0 1 2\n", {}, "a face has vertex 0, but OBJ counts from 1"),
     *(
         ("a.obj", GOOD + word + b" 1 2 3\n", {}, f"contains {word.strip().decode()}, which is not read")
@@ -391,7 +391,7 @@ def test_each_body_is_judged_by_itself(tmp_path):
         load_scene(tmp_path / "in.yaml")
     (tmp_path / "out.yaml").write_text(group % "0.8, 0.2, 0.8")
     assert notes_on_files(load_scene(tmp_path / "out.yaml")) == [
-        "1 triangles are a sheet, because they enclose nothing: three_sheets"
+        "1 triangles are a sheet, because they enclose no volume: three_sheets"
     ]
 
 

@@ -278,7 +278,7 @@ def test_wide_and_empty_scenes():
         ({"group_size": 1.0}, "group_size 1; lower group_count"),
         ({"group_size": 0.4, "group_count": 9}, "group_count must leave room"),
         ({"domain_size": (0.25,) * 3, "group_count": 0, "lone_particles": 40}, "lone_particles must leave"),
-        ({"domain_size": (0.6,) * 3, **FUNNELS, "obstacle_size": (0.1, 0.9)}, "funnel_scene_fraction must be 0 where"),
+        ({"domain_size": (0.6,) * 3, **FUNNELS, "obstacle_size": (0.1, 0.9)}, "funnel_scene_fraction must be 0 if"),
         ({"seed": -1}, "seed must be a whole number >= 0"),
         ({"seed": 1.5}, "seed must be a whole number >= 0"),
     ],
@@ -350,7 +350,7 @@ def test_own_meshes_among_the_obstacles(tmp_path):
     here, other, there = map(identity, sorted(tmp_path.glob("*/brick.stl")))
     assert here == there != other
     with pytest.raises(
-        ConfigError, match=r"obstacle_shapes must be an existing file, got none\.obj; there is none at /"
+        ConfigError, match=r"obstacle_shapes must be an existing file, got none\.obj; there is no file at /"
     ):
         identity("none.obj")
 

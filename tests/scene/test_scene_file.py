@@ -186,7 +186,7 @@ MISTAKES = [
         for number in (5000 * "9", "0x" + 5000 * "f", "-0b" + 20_000 * "1")
         for text in ("cell_size: N", "N", "gravity: [N, 0]", "? N\n: 1", "- {a: {? N : 0}}", "{? [N] : 1}")
     ),
-    ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),
+    ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got 1329"),
     (BOMB, ALIASES),
     ("groups: &a [*a]", ALIASES),
     (ONE_CUBE + "seed: 1\n" + ONE_CUBE, r"line 4: the key groups is given twice, first in line 1"),
@@ -289,13 +289,13 @@ MISTAKES = [
     (obstacle_with(shape="sphere"), OBSTACLE + r"\.shape must be one of half_box"),
     (obstacle_with(shape=None), OBSTACLE + r"\.mesh or shape must be given, .* got neither"),
     (obstacle_with(mesh="a.obj"), OBSTACLE + r"\.mesh or shape must be given, .* got both"),
-    (obstacle_with(size=None), OBSTACLE + r"\.size must be given beside shape"),
+    (obstacle_with(size=None), OBSTACLE + r"\.size must be given with shape"),
     (obstacle_with(size=-1), OBSTACLE + r"\.size must be a finite number > 0"),
-    (obstacle_with(position=None), OBSTACLE + r"\.position must be given beside shape"),
+    (obstacle_with(position=None), OBSTACLE + r"\.position must be given with shape"),
     (obstacle_with(position=[0, 0, float("nan")]), OBSTACLE + r"\.position\[2\] must be finite"),
     (obstacle_with(rotation=[0, 0, float("nan")]), OBSTACLE + r"\.rotation\[2\] must be finite"),
-    (obstacle_with(scale=2), OBSTACLE + r"\.scale must be left out beside shape"),
-    (obstacle_with(shape=None, mesh="a.obj"), OBSTACLE + r"\.size must be left out beside mesh"),
+    (obstacle_with(scale=2), OBSTACLE + r"\.scale must be left out with shape"),
+    (obstacle_with(shape=None, mesh="a.obj"), OBSTACLE + r"\.size must be left out with mesh"),
     (obstacle_with(scale=0, **MESH), OBSTACLE + r"\.scale must be a finite"),
     (obstacle_with(**MESH), OBSTACLE + r"\.mesh must be an existing file"),
     (group_with(size="wide"), "size must be a number or a list of 3 values or null, got 'wide'$"),
@@ -433,7 +433,7 @@ def test_stored_particles_inside_an_obstacle(tmp_path, inside):
         scene = load(tmp_path, groups=[{"particles": "stored.npz", "material": "sand"}], obstacles=obstacles)
         assert [note.partition(" lie")[0] for note in notes_on_files(scene)] == told
     np.savez(tmp_path / "stored.npz", position=position_N3[:0])
-    with pytest.raises(ConfigError, match="position must be of one particle or more"):
+    with pytest.raises(ConfigError, match="position must be of at least one particle"):
         load_scene(tmp_path / "scene.yaml")
 
 

@@ -229,7 +229,7 @@ BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "LOCAL_RANK": "1"
 RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
 NO_RESTARTS = (("MAX_RESTARTS", "0"), ("USE_AGENT_STORE", "False"))
 RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS": "3"}
-OTHERS = "devices must be the {} processes that the launcher started on each of {} machines"
+OTHERS = "devices must be {}, the processes that the launcher started on each of {} machines"
 
 
 @pytest.mark.parametrize(
@@ -276,12 +276,12 @@ def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
         (SLURM, OTHERS.format(4, 2)),
         (SLURM | {"SLURM_JOB_NAME": "bash"}, (2, 1)),
         (BOTH, (2, 2)),
-        ({"RANK": "0", "WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is, got RANK=0 without"),
-        ({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is"),
-        ({"RANK": "1"}, "WORLD_SIZE and LOCAL_RANK must be set where RANK is"),
-        (TORCHRUN | {"MASTER_PORT": ""}, "MASTER_PORT must be set where RANK is"),
+        ({"RANK": "0", "WORLD_SIZE": "2"}, "LOCAL_RANK must be set with RANK, got only RANK=0"),
+        ({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, "LOCAL_RANK must be set with RANK"),
+        ({"RANK": "1"}, "WORLD_SIZE and LOCAL_RANK must be set with RANK"),
+        (TORCHRUN | {"MASTER_PORT": ""}, "MASTER_PORT must be set with RANK"),
         *((SLURM | {name: text}, f"{name} must be a whole number") for name in COUNTS for text in ("", "-1", "x")),
-        ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
+        ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set with RANK"),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
         ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),
         *(({name: "4"}, f"{name} must be {alone} .*, got '4'; start with torchrun") for name, alone in ALONE.items()),

@@ -102,6 +102,6 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     out = {"weights": str(file), "frames": 2, "scene": str(tmp_path / "steep.yaml"), "out": str(tmp_path / "a.vtkhdf")}
     assert rollout.main(out) == 0
     said = capsys.readouterr().err
-    assert "friction: 1.5, those of the data of own are 0 to 1; motion is a guess" in said
-    assert "sand_friction_angle_deg: 60, those of the data of own are 15 to 45" in said
+    assert "friction: 1.5, the data of own have 0 to 1; motion is unreliable" in said
+    assert "sand_friction_angle_deg: 60, the data of own have 15 to 45" in said
     assert "no effect: poisson_ratio of groups" in said and "no effect: friction" not in said

@@ -34,7 +34,7 @@ def test_the_job_follows_from_the_configuration():
         (
             "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)",
             False,
-            "1 of 2 .*exit code 1: no ptxas.*when it is first",
+            "1 of 2 .*exit code 1: no ptxas.*at their first",
         ),
         ("import time; time.sleep(600)", True, "interrupted"),
     ],

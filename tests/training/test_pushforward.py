@@ -69,7 +69,7 @@ def test_what_is_simulated_is_drawn_from_seed_and_update():
     starts = {start for update in range(200) for start in drawn_starts(long, update, 0, frames)}
     for index, latest in ((0, 4), (2, 5), (3, 2), (4, 0)):
         assert {frame for i, frame in starts if i == index} == set(range(latest + 1))
-    with pytest.raises(ConfigError, match=r"pushforward_fraction must be 0 where no episode has 3 frames, got 0.5"):
+    with pytest.raises(ConfigError, match=r"pushforward_fraction must be 0 if no episode has 3 frames, got 0.5"):
         drawn_starts(training, 0, 0, [2, 1])
 
 

@@ -291,7 +291,7 @@ def moments(checkpoint):
     return checkpoint["optimizer_states"][0]["state"]
 
 
-STATE = "checkpoint must hold the state of a training as this version writes it, got .*last.ckpt: "
+STATE = "checkpoint must contain the state of a training of this version, got .*last.ckpt: "
 ODD = [
     (lambda checkpoint: checkpoint.pop("callbacks"), STATE + "KeyError: 'callbacks'"),
     *(

@@ -145,7 +145,7 @@ def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
     monkeypatch.setattr(TorchUpdates, "run", remember)
     gradients_with_faults(monkeypatch, {2, 3, 9, *range(12, 100)})
     monkeypatch.setattr(gradients, "MAXIMUM_SKIPPED", 5)
-    with pytest.raises(ConfigError, match="gradients must be finite, got 8 updates in a row without, up to update 20"):
+    with pytest.raises(ConfigError, match="gradients must be finite, got others in 8 updates in a row"):
         train.main(train_mapping(data, run, maximum_updates=30))
     changed = [
         any(not torch.equal(before[n][name], before[n + 1][name]) for name in before[n]) for n in range(len(before) - 1)
@@ -232,7 +232,7 @@ def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, t
     make_dataset(config)
     assert train.main(train_mapping(config, run, maximum_updates=2)) == 0
     said, last = capsys.readouterr(), run / "checkpoints" / "last.ckpt"
-    assert "no validation scenes: there will be no best.ckpt, nor errors and pictures of them" in said.err
+    assert "no validation scenes, so no best.ckpt, validation errors or pictures are written" in said.err
     assert f"no best.ckpt, because no validation scene was measured; export {last}" in said.out
     missing = run / "checkpoints" / "best.ckpt"
     assert last.is_file() and not missing.exists()
@@ -286,10 +286,10 @@ def test_damaged_checkpoints_are_refused(finished, capsys):
     resume = train._checkpoint_to_resume(config, paths[0].parent)
     errors = capsys.readouterr().err
     assert resume is not None and resume.path == paths[2]
-    assert resume.progress.sampler_state.position == 10 and errors.count("must be a whole checkpoint file") == 2
-    assert "has another CRC; trying the one before" in errors
+    assert resume.progress.sampler_state.position == 10 and errors.count("must be a complete checkpoint file") == 2
+    assert "has a wrong CRC; trying the previous one" in errors
     paths[2].write_bytes(b"")
-    with pytest.raises(ConfigError, match=r"last\.ckpt: .* has another CRC"):
+    with pytest.raises(ConfigError, match=r"last\.ckpt: .* has a wrong CRC"):
         train.main(mapping)
     assert paths[0].read_bytes() == flipped
 
@@ -315,7 +315,7 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         ({"dataset": {"training_scenes": 0}}, {}, r"more_data\[0\] must be a data set with training episodes"),
         ({"dataset": {"frame_rate_hz": 30.0}}, {}, r"more_data\[0\] must be of 60 frames a second, got 30"),
         ({"scene": {"cell_size": 1 / 32}}, {}, r"more_data\[0\] must be of solver cells of 0.015625, got 0.03125"),
-        ({"scene": {"gravity": (0.0, -1.0, 0.0)}}, {}, r"more_data\[0\] must be of dataset's gravity where"),
+        ({"scene": {"gravity": (0.0, -1.0, 0.0)}}, {}, r"more_data\[0\] must be of dataset's gravity with"),
         ({"mpm": {"poisson_ratio": 0.3}}, {}, r"must be of the same physics, got .*mpm.poisson_ratio is 0.3 there"),
     ],
 )

@@ -67,24 +67,24 @@ def test_a_run_begins_with_weights(data, tmp_path, capsys):
     tiny = {"learning_rate": 1e-12, "final_learning_rate": 1e-12, "maximum_updates": 1}
     mapping = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny)
     assert train.main(mapping) == 0
-    assert "begins with the weights" in capsys.readouterr().err
+    assert "starting with the weights" in capsys.readouterr().err
     begun, _ = load_weights(file)
     for name, tensor in network_of_checkpoint(last(tmp_path / "run"), tmp_path).state_dict().items():
         torch.testing.assert_close(tensor, begun.state_dict()[name], rtol=0, atol=1e-10)
     file.unlink()
     again = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny | {"maximum_updates": 2})
     assert train.main(again) == 0
-    assert "is not read: the run goes on from" in capsys.readouterr().err
+    assert "is not read: the run continues from" in capsys.readouterr().err
     assert last(tmp_path / "run")["hgn"]["updates"] == 2
 
 
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        ({"width": 16}, r"network.width must be 16, as in training.init_weights .*, got 8; set it so, or take other"),
+        ({"width": 16}, r"network.width must be 16, as in training.init_weights .*, got 8; use that value, or"),
         ({"materials": ("water",)}, r"network.materials must be \['water'\], as in training.init_weights"),
-        ({"rate": 30.0}, r"dataset.frame_rate_hz must be 30.0, as in training.init_weights .*, got 60.0; set"),
-        ({"cell_size": 0.02}, r"scene.cell_size must be 0.02, as in training.init_weights .*, got 0.015625; set"),
+        ({"rate": 30.0}, r"dataset.frame_rate_hz must be 30.0, as in training.init_weights .*, got 60.0; use"),
+        ({"cell_size": 0.02}, r"scene.cell_size must be 0.02, as in training.init_weights .*, got 0.015625; use"),
         (None, r"training.init_weights must be an existing file, got .*; write one with python -m hgn.export"),
     ],
 )
@@ -167,7 +167,7 @@ def test_an_export_sets_rest_walls_and_obstacles(finished, tmp_path):
         ({"checkpoint": checkpoint, "out": out, "rest_threshold": 0.1}, absolute),
         ({"weights": kept, "out": kept, "rest_threshold": 0.1}, absolute),
         ({"checkpoint": checkpoint, "out": out, "wall_clearance": [0.1, -0.1]}, r"wall_clearance\[1\] must be from 0"),
-        *(({"weights": str(file), "onnx": step, name: value}, f"{name} must be null without out, the file that it is")
+        *(({"weights": str(file), "onnx": step, name: value}, f"{name} must be null without out, the file that it")
           for name, value in given),
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=message):

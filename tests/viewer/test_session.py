@@ -346,7 +346,7 @@ def test_scenes_that_cannot_be_played():
         PlaySession(simulator(), scene, maximum_particles=20)
     empty = PlaySession(simulator(), Scene(cloud_N3[:0], cloud_N3[:0], np.zeros(0, np.uint8)))
     empty.step()
-    with pytest.raises(ConfigError, match="scene's particles must be more than none to be saved, got 0; pour some"):
+    with pytest.raises(ConfigError, match="scene's particles must be at least one to be saved, got 0; pour some"):
         empty.scene_archive()
     assert empty.drop("water", (0.5, 0.5, 0.5), 0.05) > 0
     assert len(steps(empty, 2)) > 0
