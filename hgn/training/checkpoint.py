@@ -131,6 +131,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     )
     if not plain or not isinstance(checkpoint.get(SECTION), dict):
         raise ConfigError(f"checkpoint must be a file of python -m hgn.train, got {path}")
+    for name, tensor in checkpoint["state_dict"].items():
+        # updates with other numbers would be skipped; an expanded tensor stands for any number of them
+        if tensor.nbytes > tensor.untyped_storage().nbytes() or not tensor.isfinite().all():
+            raise DamagedError(f"checkpoint must have finite numbers, each stored, got {path}: {name} has others")
     return checkpoint
 
 

@@ -110,8 +110,11 @@ def _require_shapes(optimizer: Optimizer) -> None:
     """Raises ValueError or LookupError if Adam's restored state does not belong to its parameters."""
     for parameter in optimizer.param_groups[0]["params"] if optimizer.state else ():
         for name, shape in {"step": (), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}.items():
-            if (stored := optimizer.state[parameter][name].shape) != shape:
-                raise ValueError(f"{name} of shape {list(stored)} for a parameter of {list(shape)}")
+            stored = optimizer.state[parameter][name]
+            if stored.shape != shape:
+                raise ValueError(f"{name} of shape {list(stored.shape)} for a parameter of {list(shape)}")
+            if not stored.isfinite().all():
+                raise ValueError(f"{name} of a parameter of {list(shape)} is not finite")
 
 
 def name_odd_parts(trainer: Trainer, path: Path) -> None:

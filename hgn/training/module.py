@@ -150,6 +150,11 @@ class TrainingModule(LightningModule):
         checkpoint.pop("loops", None)  # Lightning's own counters
         if not isinstance(checkpoint["callbacks"], dict):  # Lightning would resume without the lowest error
             raise TypeError("callbacks must be a mapping")
+        optimizer = checkpoint["optimizer_states"][0]
+        (group,), (own,) = optimizer["param_groups"], self.configure_optimizers().state_dict()["param_groups"]
+        optimizer["param_groups"] = [own | {"lr": group["lr"]}]  # other settings are this version's
+        if self.update > 0 and not optimizer["state"]:
+            raise LookupError("no moments of the optimiser")
         state = checkpoint["state_dict"]
         if self.averaged is None:
             for name in [name for name in state if name.startswith(AVERAGED)]:

@@ -309,6 +309,8 @@ ODD = [
         for name in ("step", "exp_avg", "exp_avg_sq")
     ),
     (lambda checkpoint: moments(checkpoint).pop(3), STATE + "KeyError: 'step'"),
+    (lambda checkpoint: moments(checkpoint)[3]["exp_avg"].fill_(torch.nan), STATE + ".* exp_avg .* finite"),
+    (lambda checkpoint: checkpoint.update(optimizer_states=[]), STATE + "IndexError"),
     (of_state(position=10**9), "sampler_state.position must be at most the 25 samples of epoch 0, got 1000000000"),
     *((of_state(**{key: -1}), f"{key} must be a finite number >= 0") for key in ("epoch", "position", "window")),
 ]
@@ -324,3 +326,32 @@ def test_checkpoints_with_other_parts_are_refused(finished, change, message):
     torch.save(checkpoint, path)
     with pytest.raises(ConfigError, match=message):
         train.main(train_mapping(data, run, maximum_updates=16))
+
+
+@pytest.mark.parametrize(
+    "options", [{"maximize": True}, {"betas": (0.9,)}, {"amsgrad": True}, {"differentiable": True}, None]
+)
+def test_the_optimiser_keeps_the_settings_of_this_version(finished, options):
+    """Those in a checkpoint, or none in it, change no update of a resumed training."""
+    data, run = finished
+    path = run / "checkpoints" / "last.ckpt"
+    checkpoint = read_checkpoint(path)
+    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
+    expected = read_checkpoint(path)["state_dict"]
+    (group,) = checkpoint["optimizer_states"][0]["param_groups"]
+    group.update(options) if options else [group.pop(name) for name in ("betas", "eps")]
+    torch.save(checkpoint, path)
+    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
+    assert_same(read_checkpoint(path)["state_dict"], expected)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_checkpoint_with_numbers_that_are_not_finite_is_damaged(finished, capsys, value):
+    """Updates from it would all be skipped. The one before it is taken."""
+    data, run = finished
+    path = run / "checkpoints" / "last.ckpt"
+    checkpoint = read_checkpoint(path)
+    checkpoint["state_dict"]["network.encode.first.weight"][0, 0] = value
+    torch.save(checkpoint, path)
+    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
+    assert "network.encode.first.weight has others; trying the previous one" in capsys.readouterr().err
