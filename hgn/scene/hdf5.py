@@ -79,6 +79,10 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
             plan, plain = item.id.get_create_plist(), (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
             packed = sum(plan.get_filter(i)[0] not in plain for i in range(plan.get_nfilters()))
             stored = item.id.get_storage_size()  # HDF5 expands it without a limit
+            written = item.id.get_num_chunks() if chunk else min(stored, 1)
+            # HDF5 would read zeros, unless the file names another value
+            if item.size and written < count and plan.fill_value_defined() != h5py.h5d.FILL_VALUE_USER_DEFINED:
+                raise ConfigError(f"{path}: {item.name} must be written as a whole, got {written} of {count} chunks")
             if packed > 1 or (packed and stored > 2 * count * size + (1 << 16)):
                 rule = f"compressed once, to fewer than its {count * size} bytes"
                 raise ConfigError(f"{path}: {item.name} must be {rule}, got {packed} filters, {stored} bytes")

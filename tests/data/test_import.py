@@ -342,9 +342,12 @@ def test_an_own_layout_may_bring_obstacle_cells(tmp_path):
     path = np.full((8, 3, 3), 0.5, np.float32)
     cell, normal = np.array([[9, 2, 2], [1, 5, 3]]), np.array([[0, 1, 0], [1, 0, 0]], np.float32)
     source = write(tmp_path / "foreign", "plain", {"train": []}, metadata(obstacle_cell_size=1 / 64))
-    np.savez(source / "train.npz", **{"a/position": path, "a/obstacle_cell": cell, "a/obstacle_normal": normal})
+    fields = {"a/position": path, "a/obstacle_cell": cell, "a/obstacle_normal": normal}
+    none = {"b/position": path, "b/obstacle_cell": cell[:0], "b/obstacle_normal": normal[:0]}
+    np.savez(source / "train.npz", **fields, **none)
     import_trajectories.main(options(tmp_path / "mine", source))
-    (episode,) = EpisodeStore(tmp_path / "mine", "train")
+    episode, free = EpisodeStore(tmp_path / "mine", "train")
+    assert not len(free.obstacle_grid.cell_K3)
     grid = episode.obstacle_grid
     assert grid.cell_K3.tolist() == [[1, 5, 3], [9, 2, 2]] and grid.cell_size == 1 / 64
     assert grid.normal_K3.tolist() == [[1, 0, 0], [0, 1, 0]]

@@ -84,6 +84,14 @@ def claimed(folder):
         file.create_dataset("00000/position", (10**6, 10**6, 2), "f4", chunks=(1, 1000, 2))
 
 
+def partly_written(folder):
+    """Positions of which one frame was written before the program ended."""
+    with h5py.File(folder / "train.h5", "a") as file:
+        old = file["00000/position"][()]
+        del file["00000/position"]
+        file.create_dataset("00000/position", old.shape, "f4", chunks=(1, *old.shape[1:]))[0] = old[0]
+
+
 def cells(cell, length=1.0):
     """Obstacle cells of the plain layout."""
 
@@ -152,11 +160,13 @@ def pickled(content):
         ("lagrangebench", meta(write_every=0), r"metadata.json: write_every must be > 0, got 0.0"),
         ("lagrangebench", hdf5("train.h5", "00000/particle_type", lambda a: 0 * a - 1), r"position must be of part"),
         ("lagrangebench", claimed, r"train.h5: /00000/position must keep the content within"),
+        ("lagrangebench", partly_written, "train.h5: /00000/position must be written as a whole, got 1 of 9 chunks"),
         ("plain", npz("00000/gravity", np.array([0, 1e14, 0])), "00000: gravity must be at most .*, one box per"),
         ("plain", meta(dt=1e-10), "dt must be a finite number > 0, from 1e-09 to 1e.09, got 1e-10"),
         ("plain", meta(obstacle_cell_size=0), r"metadata.json: obstacle_cell_size must be from 1.53e-05 .*got 0.0"),
         ("plain", meta(materials=["water"]), r"metadata.json: materials must be names by number, got \['water'\]"),
         ("plain", meta(materials={"1": "Wa ter"}), r"materials must be names of lower-case letters.*got 'Wa ter'"),
+        *(("plain", meta(boundary_types=[n]), "boundary_types must be whole numbers, at") for n in (3.5, 1e300)),
         ("plain", meta(boundary_types="none"), r"metadata.json: boundary_types must be finite numbers in a list"),
         ("plain", cells([[2, 2, 2]] * 2), r"00001: obstacle_cell must be unique, got '1 repeated'"),
         ("plain", cells([[1 << 40, 2, 2]]), r"00001: obstacle_cell must be cells inside the box"),

@@ -95,6 +95,8 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
         types = types | {_number(key, folder): _material(value, folder) for key, value in named.items()}
         boundary = given("boundary_types", None, (None,), boundary)
     types = types | {_number(key, folder): value for key, value in config.materials.items()}
+    whole = all(abs(kind) <= 1e15 and kind == int(kind) for kind in boundary)
+    require(whole, f"{folder}/metadata.json: boundary_types", "whole numbers, at most 1e15", boundary)
     size = given("g_ext_magnitude", None, ())
     gravity = given("gravity", config.gravity, (None,), [0.0] * int(dimensions) if size == 0 else None)
     if name == "lagrangebench" and config.dt is None:
@@ -270,7 +272,8 @@ def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> Non
     alike = len(cell_K3) - len(np.unique(cell_K3, axis=0))
     require(alike == 0, f"{name}: obstacle_cell", "unique", f"{alike} repeated")
     length_K = np.linalg.norm(normal_K3, axis=1)
-    require(bool((np.abs(length_K - 1) < 1e-3).all()), f"{name}: obstacle_normal", "of length 1", float(length_K.max()))
+    unit = bool((np.abs(length_K - 1) < 1e-3).all())
+    require(unit, f"{name}: obstacle_normal", "of length 1", float(length_K.max(initial=0)))
 
 
 def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
