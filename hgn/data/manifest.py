@@ -105,7 +105,8 @@ class Manifest(_Identity):
         for key in ("frames", "long_frames"):
             frames = head.config.get(key, 1)
             require(type(frames) is int and frames > 0, f"{path}.config.{key}", "a whole number > 0", frames)
-        expected = identity_hash(head.config)
+        with errors_in_config(path):
+            expected = identity_hash(head.config)
         require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, config's hash", head.config_hash)
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 

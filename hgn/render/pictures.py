@@ -27,6 +27,7 @@ RADIUS_IN_SPACINGS = 0.72  # the spheres overlap a little, so that they look lik
 REST_CELLS = 1.5  # largest thickness of walls that are not drawn: the solver bounds its particles there
 TEXT_COLOR = (45, 50, 60)
 PALETTE_SAMPLES = 40_000
+LONGEST_MS = 655_350  # longest duration of a GIF's picture
 WEBP_QUALITY = 70  # at 50 small particles smear, and at 90 the file is as large as a GIF
 Color = tuple[int, int, int]
 NO_OTHERS: Mapping[str, np.ndarray] = MappingProxyType({})
@@ -87,9 +88,9 @@ def animate(
     """Writes an animation of every `every`-th frame, with the prediction and the ground truth in adjacent panels.
 
     path: a .gif or .webp file; WebP is half as large and keeps all colours. The animation plays in real time; GIF
-    rounds the duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels; None: 720 for one
-    panel, 360 for several. progress: called with the number of pictures drawn and their total. label, others: as in
-    `compare_picture`.
+    rounds the duration of a picture to 1/100 s, WebP to 1/1000 s, and the longest is LONGEST_MS. size: width of a panel
+    in pixels; None: 720 for one panel, 360 for several. progress: called with the number of pictures drawn and their
+    total. label, others: as in `compare_picture`.
 
     Raises ConfigError as `animation_rate` does, and if an entry of `others` has other particles.
     """
@@ -109,13 +110,13 @@ def animate(
     buffer = io.BytesIO()
     if webp:
         first, *later = drawn()
-        duration = round(1000 / rate)
+        duration = min(round(1000 / rate), LONGEST_MS)
         how: dict[str, Any] = {"quality": WEBP_QUALITY, "method": 3, "xmp": WRITTEN_BY_HGN.encode()}
         first.save(buffer, "WEBP", save_all=True, append_images=later, duration=duration, loop=0, **how)
     else:
         samples = [_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)]
         pictures = map(_Palette(samples).apply, drawn())
-        duration = 10 * round(100 / rate)
+        duration = min(10 * round(100 / rate), LONGEST_MS)
         how = {"disposal": 1, "optimize": False, "comment": WRITTEN_BY_HGN.encode()}
         next(pictures).save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0, **how)
     write_picture(path, buffer.getvalue())

@@ -35,6 +35,7 @@ BOX_COLOR = (150, 156, 166)
 SUPERSAMPLING = 2
 LAYERS = 4
 OBSTACLE_OPACITY = 0.34
+MOST_SHARED = 64  # corners at a place that a smoothed normal averages; all pairs could take minutes
 CREASE_DEG = 35.0  # an edge between two faces is a crease above this angle, and is shaded smoothly below it
 AZIMUTH_DEG, ELEVATION_DEG = 28.0, 20.0
 CAMERA_DISTANCE = 3.4  # in domain diagonals; a large distance gives a weak perspective
@@ -379,8 +380,9 @@ def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     start = np.flatnonzero(np.diff(place.ravel()[order], prepend=-1))
     size = np.diff(np.append(start, len(order)))
     smooth = np.zeros((len(order), 3))
-    # Each pass pairs every corner with another one at the same place, until all pairs at a place are compared.
-    largest = int(size.max())
+    # Each pass pairs every corner with another one at the same place, until all pairs at a place are compared. In a
+    # place of more than MOST_SHARED corners an average contains that many of them.
+    largest = min(int(size.max()), MOST_SHARED)
     first_of = np.repeat(start, size)
     size_of = np.repeat(size, size)
     rank = np.arange(len(order)) - first_of

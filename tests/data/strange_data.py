@@ -437,6 +437,10 @@ cases(
         "control characters": listing(name="\x1b[31m.tar"),
         "nesting": saved("manifest.json", 400_000 * b"["),
         "config": manifest(config={"a": [[]] * 30_000}),
+        "infinite config": lambda folder: (
+            path := manifest(config={"a": 1})(folder) / "manifest.json",
+            path.write_text(path.read_text().replace('"a": 1', '"a": 1e400')),
+        )[0],
     },
     lambda folder: used(folder if folder.is_dir() else folder.parent),
 )  # fmt: skip

@@ -10,6 +10,7 @@ import trimesh
 from safetensors.torch import save
 
 from hgn.config import NetworkConfig
+from hgn.render.renderer import smooth_normals
 from hgn.runtime.weights import WeightsInfo, load_weights
 from hgn.scene.mesh import load_mesh
 from hgn.scene.obstacle_grid import build_obstacle_grid
@@ -319,6 +320,15 @@ cases(
     load_mesh,
 )
 
+
+def fan(_):
+    """The corners of 30,000 triangles, all of which meet at one place."""
+    angle = np.linspace(0, 6, 30_001)
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return np.stack([0 * ring[1:], ring[:-1], ring[1:]], axis=1)
+
+
+cases("picture", {"fan": fan}, smooth_normals)
 
 # scene files
 

@@ -11,7 +11,15 @@ from scene.test_episode import make_episode
 from scipy.ndimage import center_of_mass, label
 
 from hgn.render.error_curve import error_curve, position_error
-from hgn.render.pictures import _stage, animate, compare_picture, particle_spacing, rollout_of_episode, write_picture
+from hgn.render.pictures import (
+    LONGEST_MS,
+    _stage,
+    animate,
+    compare_picture,
+    particle_spacing,
+    rollout_of_episode,
+    write_picture,
+)
 from hgn.render.renderer import OBSTACLE_COLOR, Stage, to_bytes
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -213,6 +221,12 @@ def test_webp_animation(tmp_path):
     assert progress == [(i + 1, 12) for i in range(12)]
     assert (tmp_path / "a.webp").stat().st_size < 0.8 * (tmp_path / "a.gif").stat().st_size
     for ending in ("gif", "webp"):
+        slow = dataclasses.replace(falling_blobs(6, 6), frame_rate_hz=1e-9)
+        animate(slow, tmp_path / f"slow.{ending}", size=80)
+        with Image.open(tmp_path / f"slow.{ending}") as picture:
+            picture.seek(1)
+            picture.load()
+            assert picture.info["duration"] == LONGEST_MS  # the longest that GIF has
         animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
         with Image.open(tmp_path / f"still.{ending}") as picture:
             assert picture.n_frames == 1
