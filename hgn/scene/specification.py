@@ -53,6 +53,7 @@ class _Specification(Bounded):
     dimensions: _Dimensions = 3
     particle_counts: tuple[NonNegative[int], ...] | None = None
     groups: tuple[dict[str, Any], ...] = ()
+    layout: str = ""
 
 
 def require_specification(specification: Mapping[str, Any], settings: object, cell_size: float, name: str) -> None:

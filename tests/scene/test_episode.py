@@ -207,6 +207,7 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ),
     *((specified(dimensions=n), "json.specification.dimensions must be ") for n in (7, "two", float("nan"), True)),
     *((specified(particle_counts=c), "json.specification.particle_counts") for c in (["a"], [-3, 8], [2.5, 2.5], 5)),
+    *((specified(layout=kind), "json.specification.layout must be text") for kind in ([], {}, 5, None, "\x1b[31m")),
     *((specified(groups=g), "json.specification.groups") for g in (7, ["x"], [{"particle_count": "x"}])),
     *((specified(kind="random", obstacles=o), "json.specification.obstacles") for o in (None, 5, [5], [[]])),
     *(
