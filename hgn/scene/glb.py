@@ -144,7 +144,10 @@ class _File:
             for target, weight in zip(primitive.get("targets", ()), weights, strict=False):
                 if weight and "POSITION" in target:
                     self.claims.add("morph targets", LEAST_BYTES + position_V3.nbytes)
-                    position_V3 = position_V3 + weight * self.accessor(target["POSITION"], f"{has} a target")
+                    moved_V3 = self.accessor(target["POSITION"], f"{has} a target")
+                    if len(moved_V3) != len(position_V3):
+                        raise ValueError(f"{has} a target of {len(moved_V3)} vertices, not {len(position_V3)}")
+                    position_V3 = position_V3 + weight * moved_V3
             if "indices" in primitive:
                 index = self.accessor(primitive["indices"], f"{has} indices", "SCALAR", _INDICES)[:, 0].astype(np.int64)
             else:
@@ -185,7 +188,7 @@ class _File:
             value = value.copy()
             place, count = sparse["indices"], sparse["count"]
             at = self._values(place, np.dtype(_TYPES[place["componentType"]]), (count, 1))[:, 0]
-            value[at] = self._values(sparse["values"], dtype, (count, shape[1]))
+            value[at.astype(np.uint64, casting="same_kind")] = self._values(sparse["values"], dtype, (count, shape[1]))
         if entry.get("normalized"):
             value = np.maximum(value / np.float64(np.iinfo(dtype).max), -1.0)
         return value
@@ -234,5 +237,5 @@ def _places(translation: Any, rotation: Any, scale: Any) -> np.ndarray:
     if scale is not None:
         place_M44[:, :3, :3] *= np.reshape(np.array(scale, np.float64), (-1, 1, 3))
     if translation is not None:
-        place_M44[:, :3, 3] = translation
+        place_M44[:, :3, 3] = np.reshape(np.array(translation, np.float64), (-1, 3))
     return place_M44

@@ -220,6 +220,14 @@ def test_glb_that_lies(tmp_path):
     def part(tree, **changes):
         tree["meshes"][0]["primitives"][0].update(changes)
 
+    def morphed(tree, **changes):
+        tree["accessors"].append(tree["accessors"][0] | changes)
+        part(tree, targets=[{"POSITION": len(tree["accessors"]) - 1}])
+        tree["meshes"][0]["weights"] = [1.0]
+
+    # of the type of an index, whose first one lies in the file's last bytes: -1
+    minus_one = {"count": 1, "indices": {"bufferView": 0, "componentType": 5122}, "values": {"bufferView": 0}}
+
     changes = [
         (lambda tree: tree["accessors"][0].update(count=10**9), "readable GLB"),
         (lambda tree: tree["accessors"][0].update(count=4), "vertex 7 of a primitive with 4"),
@@ -239,6 +247,12 @@ def test_glb_that_lies(tmp_path):
             )
             for size in (-1, 1.5, 8.0, "8")
         ),
+        *(
+            (lambda tree, n=n: tree["nodes"][0].update(translation=n), "readable GLB")
+            for n in (2.0, [5.0], [1, 2, 3, 4])
+        ),
+        (lambda tree: morphed(tree, count=4), "primitive 0 of mesh 0 has a target of 4 vertices, not 8"),
+        (lambda tree: morphed(tree, sparse=minus_one), "Cannot cast array data from dtype.'int16'"),
         (lambda tree: tree["nodes"][0].update(skin=0), "node 0 has a skin"),
         (loop, "node 0 has two parents"),
         (lambda tree: tree["asset"].update(minVersion="2.1"), "it needs glTF 2.1, but only 2.0 is supported"),
