@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_965,
+    "hgn": 33_992,
     "datagen": 8_929,
     "tools": 6_344,
-    "tests": 34_762,
+    "tests": 34_850,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -119,13 +119,13 @@ class ThreadedLogger(TrainerLogger):
         try:
             logger = BUILDERS[self._kind](self._run, self._settings)
         except Exception as error:  # noqa: BLE001 - printed
-            self._report(error)
+            self._report(error.__cause__ or error)
             return
         while (function := self._calls.get()) is not None:
             try:
                 function(logger)
             except Exception as error:  # noqa: BLE001 - printed; the server may be back at the next call
-                self._report(error)
+                self._report(error.__cause__ or error)  # Lightning takes every fault for an unsupported value
 
     def _report(self, fault: object) -> None:
         if not self._reported:

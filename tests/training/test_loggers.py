@@ -28,7 +28,7 @@ class Remembered(Logger):
     def take(self, method, *values):
         self.calls.append((method, values))
         if method in self.faults:
-            raise ConnectionError("the server is away")
+            raise ValueError("not supported") from ConnectionError("the server is away")  # as Lightning does
 
     name = version = property(lambda self: "remembered")
     log_metrics = functools.partialmethod(take, "metrics")
