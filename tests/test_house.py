@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_992,
+    "hgn": 33_993,
     "datagen": 8_929,
     "tools": 6_344,
     "tests": 34_850,

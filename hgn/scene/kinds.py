@@ -17,7 +17,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "motion": {"obstacles": (0, 6), "groups": (1, 6), "size": (0.04, 0.14), "speed": (0.5, 4.0)},
     "collision": {"groups": (2, 6), "size": (0.05, 0.14), "speed": (0.5, 5.0)},
     "funnel": {"groups": (1, 5), "size": (0.06, 0.13), "hole": (0.035, 0.2)},
-    "pool": {"depth": (0.03, 0.16), "tilt": (0.0, 0.13), "size": (0.04, 0.09), "height": (0.02, 0.2)},
+    "pool": {"depth": (0.03, 0.16), "tilt": (0.0, 0.42), "size": (0.04, 0.09), "height": (0.02, 0.2)},
     "dam": {"length": (0.06, 0.3), "height": (0.08, 0.35), "wet": (0.02, 0.05)},
     "column": {"width": (0.06, 0.18), "depth": (0.06, 0.18), "height": (0.05, 0.4)},
     "drop": {"size": (0.04, 0.25), "height": (0.0, 0.8), "speed": (0.0, 5.0)},

@@ -179,13 +179,13 @@ def _about_z(tangent: float) -> Quaternion:
 
 
 def _pool(new: Layout) -> None:
-    """Fills the floor from wall to wall, often with water at rest. Gravity may be tilted, or a body falls in."""
+    """Fills the floor from wall to wall with water or sand at rest. Gravity may be tilted, or a body falls in."""
     new.take_domain("small", "box", "tray", "flume", "slit")
     top = new.low + new("depth")
-    material = "water" if new.chance(0.6) else ""
+    material = "water" if new.chance(0.5) else new.one_of("sand", "sand", "")
     new.box((new.low,) * 3, (new.high(0), top, new.high(2)), material=material)
     if new.chance(0.5):
-        new.tilt_gravity(new("tilt"))
+        new.tilt_gravity(new("tilt", small=True))
     if new.chance(0.3):
         size = new("size")
         height = top + NEAREST_CELLS * new.config.cell_size + 0.5 * size + new("height")
@@ -223,7 +223,7 @@ def _drop(new: Layout) -> None:
 
 
 def _slope(new: Layout) -> None:
-    """Places one or two bodies on a tilted plate. They slide off its lower end."""
+    """Places one or two bodies, half of them of sand, on a tilted plate. They slide off its lower end."""
     new.take_domain("room", "hall")
     plate, tangent = new("plate"), new("tilt")
     cosine, sine = _turn(tangent)
@@ -235,7 +235,8 @@ def _slope(new: Layout) -> None:
         room = 0.5 * (plate - size)
         gap = 0.5 * size * (cosine + sine) + (NEAREST_CELLS + 1) * new.config.cell_size
         up = np.array((cosine, sine, 0.0)) * along * room + np.array((-sine, cosine, 0.0)) * gap
-        new.body(size, triple(middle + up + np.array((0.0, 0.0, 2 * across * room))))
+        centre = triple(middle + up + np.array((0.0, 0.0, 2 * across * room)))
+        new.body(size, centre, material="sand" if new.chance(0.5) else "")
 
 
 def _edge(new: Layout) -> None:

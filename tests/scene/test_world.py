@@ -61,7 +61,7 @@ def test_scenes_of_a_kind_are_sound(kind):
     assert len(digests) == 4 and digest(scene_of.__wrapped__(kind, 0)) in digests
 
 
-GOLDEN = "c53a6ca1"  # of one scene of each kind
+GOLDEN = "22c6ec30"  # of one scene of each kind
 
 
 def test_a_kind_is_bitwise_the_same_everywhere():
@@ -140,7 +140,7 @@ def test_half_of_the_stacks_are_cubes_of_one_material():
 def test_gravity_is_as_large_however_it_is_tilted():
     sizes = [np.linalg.norm(scene_of("pool", seed).gravity) for seed in range(20)]
     across = [np.linalg.norm(np.array(scene_of("pool", seed).gravity)[[0, 2]]) for seed in range(20)]
-    assert np.allclose(sizes, 9.8) and 4 <= np.count_nonzero(across) <= 17 and max(across) < 9.8 * 0.26
+    assert np.allclose(sizes, 9.8) and 4 <= np.count_nonzero(across) <= 17 and 9.8 * 0.5 < max(across) < 9.8 * 0.72
 
 
 def test_kinds_are_drawn_by_their_shares():
