@@ -158,7 +158,7 @@ def _corners_of_stl(data: bytes) -> np.ndarray:
             refuse_utf_16(data)
             raise ValueError(f"it has {len(data)} of {size} bytes")
         return np.frombuffer(data[84:size], _BINARY_FACET)["corners"]  # some programs append bytes to the triangles
-    if b"endsolid" not in text.lower():
+    if b"endsolid" not in text.lower().rpartition(b"endfacet")[2]:  # a name may contain it too
         raise ValueError("it ends before endsolid")
     if part := _PART_OF_FACET.search(_FACET.sub(b"\n", text)):
         raise ValueError(f"it has an incomplete facet: {part[0].decode('utf-8', 'replace').strip()[:80]}")

@@ -5,6 +5,7 @@ corners that are left, W polygons whose next ear is not yet found.
 """
 
 import codecs
+import io
 import re
 import struct
 from collections.abc import Sequence
@@ -76,22 +77,26 @@ def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
 
 def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices and faces of a PLY file, as `polygons_of_obj`. Raises: ValueError or LookupError if damaged."""
-    end = re.search(rb"end_header[ \t]*\r?\n", data)
-    if end is None or not data.startswith(b"ply"):
-        refuse_utf_16(data)
-        raise ValueError("it has no header of PLY")
-    form, elements = "", list[tuple[str, int, list[list[str]]]]()
-    for line in data[: end.start()].decode("ascii", "replace").splitlines():
-        words = line.split() or [""]
+    refuse_utf_16(data)
+    file, form, element, elements = io.BytesIO(data), "", "", dict[str, tuple[int, list[list[str]]]]()
+    for line in file if data.startswith(b"ply") else ():
+        words = line.decode("ascii", "replace").split() or [""]
+        if words == ["end_header"]:
+            break
         if words[0] == "format":
             form = words[1]
         elif words[0] == "element":
-            elements.append((words[1], int(*number_words(words[2].encode())), []))
+            element = words[1]
+            if element in elements:
+                raise ValueError(f"it has the element {element[:80]} twice")
+            elements[element] = int(*number_words(words[2].encode())), []
         elif words[0] == "property":
-            elements[-1][2].append(words[1:])
-    numbers = _Numbers(data[end.end() :], "" if form == "ascii" else "<>"["big" in form])
+            elements[element][1].append(words[1:])
+    else:
+        raise ValueError("it has no header of PLY")
+    numbers = _Numbers(data[file.tell() :], "" if form == "ascii" else "<>"["big" in form])
     vertex_V3, faces = np.zeros((0, 3)), list[np.ndarray]()
-    for name, count, properties in elements:
+    for name, (count, properties) in elements.items():
         names = [entry[-1] for entry in properties]
         if name == "tristrips" and count:
             raise ValueError("it contains tristrips, which are not read; write polygons")

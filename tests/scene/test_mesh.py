@@ -132,6 +132,10 @@ REFUSED = [
     ("a.stl", bytes(80) + struct.pack("<I", 3) + bytes(149), {}, "it has 233 of 234 bytes"),
     ("a.stl", b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", {}, "it ends before endsolid"),
     *(
+        ("a.stl", b"\n".join([head, *FACETS]), {}, "it ends before endsolid")
+        for head in (b"solid endsolid", b"solid\nendsolid\nsolid")
+    ),
+    *(
         ("a.stl", b"\n".join([b"solid", *FACETS[:first], *FACETS[last:], b"endsolid"]), {}, "incomplete facet: f")
         for first, last in ((3, 7), (5, 7), (6, 7), (12, 14), (13, 14), (2, 3))
     ),
@@ -156,6 +160,9 @@ REFUSED = [
         for face in (b"3 0 1 1.5", b"3 0.5 1 2", b"3.5 0 1 2", b"3 0 1 nan")
     ),
     ("a.ply", PLY.replace(b"face 1", b"face 2").replace(b"0 1 2", b"0 1 2\n4 0 1 2 1.5"), {}, "it has 1.5 where its"),
+    ("a.ply", PLY.replace(b"element face", b"element vertex 3\nelement face"), {}, "has the element vertex twice"),
+    ("a.ply", PLY.replace(b"element vertex 3\n", b""), {}, READABLE.format("PLY")),
+    ("a.ply", PLY.replace(b"end_header", b"comment end_header"), {}, "it has no header of PLY"),
     ("a.ply", PLY.replace(b"face 1", b"tristrips 1"), {}, "it contains tristrips, which are not read"),
     ("a.ply", PLY.replace(b"uchar int", b"uchar float"), {}, "by numbers that are not whole"),
     *(
@@ -224,6 +231,20 @@ def test_spellings_of_obj(tmp_path, text):
     write(tmp_path, STEPS, "usual.obj")
     assert load_mesh(tmp_path / "mesh.obj").corners.tolist() == load_mesh(tmp_path / "usual.obj").corners.tolist()
     assert len(load_mesh(tmp_path / "mesh.obj").triangle_F3) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"format", b"comment end_header\nobj_info end_header\ncomment the end_header\nformat"),
+        (b"format", b"comment \v element vertex 9\ncomment \x1e property float x\nformat"),
+        *((b"\n", b"\r\n"), (b"\n", b" \n"), (b"\n", b"\n "), (b"float x", b" float\tx")),
+    ],
+)
+def test_spellings_of_ply(tmp_path, old, new):
+    """Comments of any words, line ends and spaces change nothing."""
+    (tmp_path / "a.ply").write_bytes(PLY.replace(old, new))
+    assert load_mesh(tmp_path / "a.ply").corners.tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
 
 
 # outlines, counterclockwise; the area of each
