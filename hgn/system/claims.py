@@ -65,7 +65,7 @@ def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*"))
             items += [stack.pop() or 0 for _ in before]
             sizes = [size or 0 for size in items]
             if sum(sizes) > MOST_ITEMS:
-                raise ValueError(f"references that stand for {sum(sizes)} items")
+                raise ValueError(_too_many())
             pairs = operation.name == "REDUCE" and sizes[1] == 0 and sizes[0] > 1
             key = operation.name in ("SETITEM", "SETITEMS", "DICT") and max(sizes[1::2], default=1) > 1
             if pairs or key or operation.name in ("ADDITEMS", "FROZENSET"):
@@ -75,8 +75,12 @@ def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*"))
 
 def require_few_items(value: Any) -> None:
     """Checks the number of items of nested lists. Raises ValueError for more than MOST_ITEMS, references resolved."""
-    if (count := count_items(value)) > MOST_ITEMS:
-        raise ValueError(f"references that stand for {count:.3g} items")
+    if count_items(value) > MOST_ITEMS:
+        raise ValueError(_too_many())
+
+
+def _too_many() -> str:
+    return f"more than {MOST_ITEMS} items; a reference counts as all of its items"
 
 
 def _parts(value: Any) -> Iterable[Any] | None:

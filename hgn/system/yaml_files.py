@@ -17,7 +17,7 @@ from hgn.schema import ConfigError, require
 from hgn.system.claims import count_items
 
 MAXIMUM_BYTES = 250_000  # largest size of a YAML file: PyYAML takes a CPU second for 50 kB
-MAXIMUM_NODES = 100_000  # nodes of a file
+MAXIMUM_NODES = 100_000  # values of a file, aliases resolved
 MAXIMUM_DIGITS = 1000  # characters of a number of a file: Python does not print integers of 4,300 digits
 # bytes of a JSON file for the search of a line: it has fewer nodes then, and YAML takes a CPU second for 50 kB
 LINES_BYTES = 2 * MAXIMUM_NODES
@@ -31,8 +31,8 @@ def read_yaml(path: Path) -> Any:
     """Returns the content of a YAML file as plain containers.
 
     Raises ConfigError, one line that starts with the path, for: a file that cannot be read, more than MAXIMUM_BYTES, a
-    repeated key, numbers that are octal, sexagesimal, very long or have _, and aliases that expand to more than
-    MAXIMUM_NODES values.
+    repeated key, numbers that are octal, sexagesimal, very long or have _, and more than MAXIMUM_NODES values, aliases
+    resolved.
     """
     rule, size = f"a YAML file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
     require(size <= MAXIMUM_BYTES, str(path), rule, size, "particles belong in .npz files")
@@ -73,7 +73,7 @@ class _Loader(yaml.SafeLoader):
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
         if count_items(node, _parts) > MAXIMUM_NODES:
-            raise ValueError(f"its aliases expand to more than {MAXIMUM_NODES} values")
+            raise ValueError(f"it has more than {MAXIMUM_NODES} values; an alias counts as all of its values")
         if node is not None:
             _check(node, "", set(), self)
         return node

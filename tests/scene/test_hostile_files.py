@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import pickle
 import resource
 import signal
 import struct
@@ -41,6 +42,8 @@ from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping
 from hgn.step_config import StepConfig
+from hgn.system import claims
+from hgn.system.claims import require_few_items, require_plain_pickle
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.imported import settings_of_imported
 
@@ -187,6 +190,17 @@ def test_archives_that_torch_reads_otherwise(tmp_path, change, message):
         change(path, archive)
     with pytest.raises(ConfigError, match=message):
         read_checkpoint(path)
+
+
+def test_lists_that_are_too_long(monkeypatch):
+    """A message says what counts: the items of a long list, and those of references."""
+    monkeypatch.setattr(claims, "MOST_ITEMS", 9)
+    shared = (1, 2, 3)
+    for value in (list(range(12)), [shared] * 4):
+        for check in (require_few_items, lambda value: require_plain_pickle(pickle.dumps((*value,), protocol=2))):
+            with pytest.raises(ValueError, match="more than 9 items; a reference counts as all of its items"):
+                check(value)
+    require_few_items(list(range(8)))
 
 
 def tar():
