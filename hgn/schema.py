@@ -10,12 +10,14 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import json
 import linecache
 import math
 import re
 import reprlib
 import types
 import typing
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral
 from pathlib import Path
@@ -154,6 +156,22 @@ def printable(text: str) -> str:
     for pattern, kept in _SECRETS:
         text = re.sub(pattern, kept, text)
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def strict_json(text: str | bytes, **options: Any) -> Any:
+    """Parses JSON, with options of json.loads. Raises: ValueError, also for a repeated key and for deep nesting."""
+    try:
+        return json.loads(text, object_pairs_hook=_without_repetition, **options)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
+        ((repeated, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"the key {repeated[:100]} is given twice")
+    return mapping
 
 
 def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:

@@ -3,7 +3,6 @@
 `fresh.json` in the data set's folder stores it with their hashes. It is written once, before the first scene is made.
 """
 
-import json
 import secrets
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any
 from hgn.data.manifest import MANIFEST_NAME
 from hgn.data.storage import is_remote, local_folder
 from hgn.data.verification import file_sha256
-from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.schema import ConfigError, from_mapping, require, strict_json, to_mapping
 from hgn.system.files import write_json
 
 FRESH_NAME = "fresh.json"
@@ -62,8 +61,8 @@ def read_fresh(folder: Path | str) -> FreshSeed | None:
     if is_remote(folder) or not path.is_file():
         return None
     try:
-        return from_mapping(FreshSeed, json.loads(path.read_text()), str(path))
-    except (ValueError, RecursionError) as error:
+        return from_mapping(FreshSeed, strict_json(path.read_text()), str(path))
+    except ValueError as error:
         raise ConfigError(f"{path} must be a file that python -m datagen frozen=… wrote, got {error}") from error
 
 

@@ -36,7 +36,7 @@ from hgn.data.entries import (
     totals_of,
 )
 from hgn.data.storage import Storage, StorageError, ask
-from hgn.schema import Bounded, ConfigError, NonNegative, from_mapping, to_mapping
+from hgn.schema import Bounded, ConfigError, NonNegative, from_mapping, strict_json, to_mapping
 from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
 INDEX_NAME = "index"
@@ -329,10 +329,10 @@ def begin(folder: Path, current: int = 0) -> Index:
 
 
 def parse_json(content: bytes, path: str) -> Any:
-    """Parses strict JSON. Raises: ConfigError, also for NaN and infinities."""
+    """Parses strict JSON. Raises: ConfigError, also for repeated keys, NaN and infinities."""
     try:
-        return json.loads(content, parse_constant=_refuse)
-    except (ValueError, RecursionError) as error:
+        return strict_json(content, parse_constant=_refuse)
+    except ValueError as error:
         raise StorageError(f"{path} must be JSON written by python -m datagen, got {error}; {REMEDY}") from None
 
 

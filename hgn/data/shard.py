@@ -40,7 +40,9 @@ def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
                 if not 0 <= info.size <= size:
                     raise tarfile.ReadError(f"{info.name} of {info.size} bytes")
                 key, _, name = info.name.partition(".")
-                located.setdefault(key, {})[name] = (info.offset_data, info.size)
+                if name in located.setdefault(key, {}):
+                    raise tarfile.ReadError(f"{info.name} twice")
+                located[key][name] = (info.offset_data, info.size)
     # numbers in headers raise any of these, and long names in a row MemoryError
     except (tarfile.TarError, ValueError, LookupError, ArithmeticError, RecursionError, MemoryError) as error:
         raise ConfigError(

@@ -30,6 +30,7 @@ from hgn.schema import (
     near_file,
     near_name,
     require,
+    strict_json,
     to_mapping,
 )
 from hgn.step_config import StepConfig
@@ -120,7 +121,7 @@ def load_weights(
     try:
         data = path.read_bytes()  # not mapped: a file that another program cut would end the process
         tensors = load(data)
-        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
+        metadata = strict_json(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         remedy = f"python -m hgn.export checkpoint={path} out=…" if path.suffix == ".ckpt" else "export it again"
         raise ConfigError(
@@ -129,8 +130,8 @@ def load_weights(
     if "hgn" not in metadata:
         raise ConfigError(f"{field} must be a file of python -m hgn.export, got {path} without its structure")
     try:
-        mapping = json.loads(metadata["hgn"])
-    except (ValueError, RecursionError) as error:
+        mapping = strict_json(metadata["hgn"])
+    except ValueError as error:
         raise ConfigError(f"{field} must declare their structure as JSON, got {path}: {error}") from None
     version = mapping.get("format_version") if isinstance(mapping, dict) else None
     if version != FORMAT_VERSION:

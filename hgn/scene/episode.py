@@ -22,7 +22,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
 from hgn.scene.specification import require_specification
-from hgn.schema import BoxSize, ConfigError, OrdinarySize, Vector, from_mapping, require, require_bounds
+from hgn.schema import BoxSize, ConfigError, OrdinarySize, Vector, from_mapping, require, require_bounds, strict_json
 
 SCHEMA_VERSION = 1
 
@@ -285,8 +285,8 @@ def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: in
 
 def _decode_description(key: str, text: bytes) -> _Description:
     try:
-        mapping = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        mapping = strict_json(text)
+    except ValueError as error:
         raise ConfigError(f"{key}.json must be JSON, got {error}") from None
     require_schema_version(mapping, f"{key}.json")
     description = from_mapping(_Description, mapping, f"{key}.json")

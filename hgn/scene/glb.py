@@ -4,7 +4,6 @@ Materials, textures, cameras, lights and animations are ignored. Skins are refus
 """
 
 import base64
-import json
 import re
 import struct
 from collections.abc import Collection, Iterator
@@ -16,6 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hgn.schema import strict_json
 from hgn.system.claims import Claims
 
 INSTANCES = "EXT_mesh_gpu_instancing"
@@ -70,7 +70,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         place += 8 + size
     if len(chunks[b"JSON"]) > MOST_JSON_BYTES:
         raise ValueError(f"its JSON must have at most {MOST_JSON_BYTES} bytes, got {len(chunks[b'JSON'])}")
-    return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
+    return strict_json(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
 
 
 class _Entries(list[Any]):

@@ -31,7 +31,7 @@ from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
-from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds, triple
+from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds, strict_json, triple
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
 
@@ -395,7 +395,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
     with np.errstate(over="ignore"):  # infinite places of particles are refused
         position_TP3[shown_TP] = points[()]
-    source = json.loads(own["source"][()])
+    source = strict_json(own["source"][()])
     require(isinstance(source, dict), "source", "a mapping", source)
     rollout = Rollout(
         position_TN3=position_TP3[:, vertices:],

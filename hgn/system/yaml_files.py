@@ -5,22 +5,18 @@ refuses all of these and names the key and the line.
 """
 
 import itertools
-import json
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, require, strict_json
 from hgn.system.claims import count_items
 
 MAXIMUM_BYTES = 250_000  # largest size of a YAML file: PyYAML takes a CPU second for 50 kB
 MAXIMUM_NODES = 100_000  # values of a file, aliases resolved
 MAXIMUM_DIGITS = 1000  # characters of a number of a file: Python does not print integers of 4,300 digits
-# bytes of a JSON file for the search of a line: it has fewer nodes then, and YAML takes a CPU second for 50 kB
-LINES_BYTES = 2 * MAXIMUM_NODES
 # of PyYAML, of thousands of digits, of deep nesting, and of tags such as `!!bool 5`
 _ERRORS = (yaml.YAMLError, ValueError, RecursionError, LookupError, TypeError, AttributeError, ArithmeticError)
 _OCTAL = re.compile(r"[-+]?0[0-7_]*[1-7][0-7_]*")
@@ -52,19 +48,7 @@ def read_yaml(path: Path) -> Any:
 
 def read_json(path: Path) -> Any:
     """Returns the content of a JSON file. Raises ValueError for another file, or for a repeated key."""
-    text = path.read_text("utf-8")
-
-    def unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            if len(text) < LINES_BYTES:
-                yaml.load(text.replace("\t", " "), _Loader)  # raises an error with key and line
-            raise ValueError(f"a key is given twice, one of {', '.join(dict(pairs))[:100]}")
-        return dict(pairs)
-
-    try:
-        return json.loads(text, object_pairs_hook=unique)
-    except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
+    return strict_json(path.read_text("utf-8"))
 
 
 class _Loader(yaml.SafeLoader):

@@ -102,13 +102,16 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         if not path.is_file():  # reading a pipe would wait for ever
             raise FileNotFoundError
         with zipfile.ZipFile(path) as records:
-            claims = Claims(path)
+            claims, names = Claims(path), set[str]()
             _require_one_reading(path, records.start_dir)
             for record in records.infolist():
                 claims.add(record.filename, record.file_size)
+                if (name := record.filename.lower()) in names:  # torch ignores the case of names
+                    raise ValueError(f"it has {record.filename} twice")
+                names.add(name)
                 if record.compress_type != zipfile.ZIP_STORED:
                     raise ValueError(f"{record.filename} is compressed")
-                if record.filename.lower().endswith("/data.pkl"):  # torch ignores the case of names
+                if name.endswith("/data.pkl"):
                     require_plain_pickle(records.read(record), _CALLED)
             if (damaged := records.testzip()) is not None:
                 raise zlib.error(f"{damaged} has a wrong CRC")

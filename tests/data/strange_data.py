@@ -343,6 +343,7 @@ cases(
         "a large number": tar_headers(b"0", 1, b"\x80" + b"\x7f" * 10),
         "sparse files": tar_headers(b"S", 900, b"77777777777"),
         "links": tar_headers(b"2", 900),
+        "a name twice": tar_headers(b"0", 2),
     },
     lambda path: [*locate_members(path)],
 )

@@ -45,10 +45,11 @@ def test_what_reports_say_of_a_set(weights, tmp_path):
     assert chosen == {"seed": 3, "drawn": None, "not_frozen_before": ["own.safetensors"]}
     with pytest.raises(ConfigError, match=r"fresh\.json: seed must be the data set's own"):
         set_record(folder, fresh.seed + 1, [weights])
-    (folder / "fresh.json").write_text(json.dumps({"seed": "x"}))
-    message = r"fresh\.json must be a file that python -m datagen frozen=… wrote, got .*seed must be"
-    with pytest.raises(ConfigError, match=message):
-        read_fresh(folder)
+    message = r"fresh\.json must be a file that python -m datagen frozen=… wrote, got .*"
+    for text, cause in ((json.dumps({"seed": "x"}), "seed must be"), ('{"seed": 1, "seed": 2}', "seed is given twice")):
+        (folder / "fresh.json").write_text(text)
+        with pytest.raises(ConfigError, match=message + cause):
+            read_fresh(folder)
 
 
 def test_what_is_no_fresh_set_is_refused(weights, tmp_path, folder):

@@ -77,6 +77,7 @@ def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeyp
 CUT = r"manifest\.json must be JSON .* run the generator again without manifest.json"
 FAULTS = [  # the place in a manifest or in a line of its index, its value, the message
     *(("", content, CUT) for content in (b"", b"{", b"\xff\xfe")),
+    ("", b'{"revision": 3, "revision": 4}', "must be JSON .* got the key revision is given twice"),
     ("schema_version", 2, "schema_version must be 1, got 2; .* or use the version that made it"),
     ("colour", 1, "colour is not a known key"),
     ("revision", "3", "revision must be a whole number, got '3'"),

@@ -181,6 +181,7 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"position.npy": None}, "member position.npy is missing"),
     ({"colour.npy": npy(np.zeros(5))}, "train-000012.colour.npy is not a known member"),
     ({"json": b"{"}, "train-000012.json must be JSON"),
+    ({"json": b'{"seed": 1, "seed": 2}'}, "train-000012.json must be JSON, got the key seed is given twice"),
     ({"json": b"[]"}, "schema_version must be 1, got None"),
     ({"json": description(schema_version=2)}, "schema_version must be 1, got 2; generate .* or use the version that"),
     ({"json": description(seed=None)}, "train-000012.json.seed is missing"),

@@ -272,3 +272,6 @@ def test_glb_that_lies(tmp_path):
         path = broken(change)
         with pytest.raises(ConfigError, match=message):
             load_mesh(path)
+    path.write_bytes(path.read_bytes().replace(b'"scenes"', b'"meshes"'))
+    with pytest.raises(ConfigError, match="the key meshes is given twice"):
+        load_mesh(path)

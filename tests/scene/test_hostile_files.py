@@ -169,6 +169,7 @@ def checkpoint():
         return "last.ckpt", path.read_bytes(), read_checkpoint
 
 
+@pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -179,6 +180,8 @@ def checkpoint():
         ),
         (lambda _, archive: archive.writestr("a/DATA.PKL", b"\x80\x02ctorch\nTensor\n."), "torch Tensor, which is no"),
         (lambda _, archive: archive.writestr("a/b", b"x", zipfile.ZIP_BZIP2), "a/b is compressed"),
+        (lambda _, archive: archive.writestr(archive.filelist[-1].filename, b"x"), "twice"),
+        (lambda _, archive: archive.writestr("last/DATA.PKL", b"\x80\x02}."), "twice"),
         (lambda path, _: torch.save({"hgn": {}, "state_dict": {5: torch.zeros(1)}}, path), "must be a file of python"),
     ],
 )

@@ -269,6 +269,7 @@ def external_points(file):
         (attribute("dimensions", 2.5), "dimensions must be 2 or 3, got 2.5"),
         (attribute("dimensions", 2.0), "dimensions must be 2 or 3, got 2.0"),
         (attribute("cell_size", 0.0), "cell_size must be from 1e-9 to 1e9"),
+        (array("hgn/source", '{"a": 1, "a": 2}'), "must be a complete HDF5 file, got the key a is given twice"),
         (array("hgn/source", "3"), "source must be a mapping, got 3"),
         (array("hgn", h5py.SoftLink("/hgn")), "must contain its data itself"),
         (array("VTKHDF/PointData/material", np.full(14, 0.5)), "material_N must be whole numbers, got 'float64'"),
