@@ -97,8 +97,15 @@ NonNegative = Annotated[
     Bound("a finite number >= 0", lambda value: 0 <= value < math.inf),
     Bound("at most 1e30, the range of fp32", lambda value: value <= 1e30),
 ]
-Finite = Annotated[float, Bound("finite", math.isfinite)]
+# fp32 stores the squares of these numbers
+Finite = Annotated[
+    float, Bound("finite", math.isfinite), Bound("at most 1e15 in size", lambda value: abs(value) <= 1e15)
+]
 Vector = tuple[Finite, Finite, Finite]
+Range = Annotated[
+    tuple[float, float],
+    Bound("from -1e15 to 1e15, the smaller one first", lambda ends: -1e15 <= ends[0] <= ends[1] <= 1e15),
+]
 Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]
 AtMostOne = Annotated[N, Bound("at most 1", lambda value: value <= 1)]
 BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value < 1)]
@@ -345,6 +352,9 @@ def _require_bound(hint: Any, value: Any, name: str) -> None:
     if typing.get_origin(hint) is tuple:
         for i, item in enumerate(value):
             _require_bound(options[0], item, f"{name}[{i}]")
+    elif typing.get_origin(hint) is dict:
+        for key, item in value.items():
+            _require_bound(options[0], item, f"{name}.{key}")
     elif options and value is not None:  # an optional type
         _require_bound(options[0], value, name)
 

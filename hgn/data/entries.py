@@ -1,7 +1,6 @@
 """Defines the entries of a data set's index: episodes, shards and their totals."""
 
 import hashlib
-import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -95,12 +94,13 @@ Totals = dict[str, SplitTotals]
 
 
 def require_sound(statistics: Statistics) -> None:
-    """Raises ConfigError for numbers that are not finite, and for negative counts or squares."""
+    """Raises ConfigError for numbers that are too large or not finite, and for negative counts or squares."""
     for name in ("velocity", "acceleration"):
         moments: Moments = getattr(statistics, name)
-        numbers = (moments.count, *moments.mean, *moments.squared_deviation)
-        if not (all(map(math.isfinite, numbers)) and min(moments.count, *moments.squared_deviation) >= 0):
-            raise ConfigError(f"statistics.{name} must be finite, with count and squares >= 0, got {moments}; {REMEDY}")
+        counts = (moments.count, *moments.squared_deviation)
+        sound = all(x >= 0 for x in counts) and all(abs(x) <= 1e15 for x in (*moments.mean, *moments.std))
+        rule = "at most 1e15 in size, with count and squares >= 0"
+        require(sound, f"statistics.{name}", rule, moments, remedy=REMEDY)
 
 
 def no_totals() -> Totals:

@@ -25,6 +25,7 @@ from hgn.schema import (
     ConfigError,
     NonNegative,
     OrdinarySize,
+    Range,
     Vector,
     from_mapping,
     near_file,
@@ -54,10 +55,10 @@ class WeightsInfo(Bounded):
     # largest initial speed of the data's groups, domain units per second; null: unknown
     maximum_initial_speed: NonNegative[float] | None = None
     # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
-    own_ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    own_ranges: dict[str, Range] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
     step: StepConfig = field(default_factory=StepConfig)  # constraints of each frame
-    updates: int = 0  # number of updates of the training
+    updates: NonNegative[int] = 0  # number of updates of the training
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
 
 

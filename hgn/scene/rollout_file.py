@@ -80,7 +80,6 @@ class Rollout:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(max(map(abs, self.gravity)) <= LARGEST, "gravity", "at most 1e15", list(self.gravity))
         shape = self.position_TN3.shape
         if len(shape) != 3 or shape[0] < 1 or shape[2] != 3:
             raise ConfigError(f"position_TN3 must have shape (frames >= 1, particles, 3), got {shape}")

@@ -400,12 +400,9 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
     if entry.mesh is None:
         assert entry.shape is not None and entry.size is not None and entry.position is not None
         name = f"obstacle_{index}_{entry.shape}"
-        with np.errstate(over="ignore"):
-            bodies: tuple[Obstacle, ...] = (
-                shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name),
-            )
-        finite = bool(np.isfinite(bodies[0].vertex_V3).all())
-        require(finite, f"obstacles[{index}].position", "in the range of float32", entry.position)
+        bodies: tuple[Obstacle, ...] = (
+            shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name),
+        )
     else:
         # it imports parts of SciPy that few scenes need
         from hgn.scene.mesh import load_bodies

@@ -26,6 +26,7 @@ from hgn.schema import (
     ConfigError,
     NonNegative,
     OrdinarySize,
+    Range,
     Vector,
     from_stored,
     near_file,
@@ -58,7 +59,7 @@ class DataInfo(Bounded):
     gravity: Vector = (0.0, -9.8, 0.0)
     maximum_initial_speed: NonNegative[float] | None = None  # of the groups, domain units per second; None: unknown
     # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
-    own_ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    own_ranges: dict[str, Range] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,12 @@ FAULTS = [  # the place in a manifest or in a line of its index, its value, the 
     ("shards.0.bytes", None, r"jsonl\.bytes must be a whole number"),
     ("shards.0.bytes", -1, r"jsonl\.bytes must be a finite number >= 0"),
     ("shards.0.statistics.velocity.mean", [math.nan, 0, 0], "must be JSON .* got NaN"),
-    ("shards.0.statistics.velocity.count", -1, "must be finite, with count"),
+    *(
+        (f"shards.0.statistics.velocity.{name}", [0, 1e300, 0], "must be at most 1e15 in size, with count and squares")
+        for name in ("mean", "squared_deviation")
+    ),
+    ("shards.0.statistics.velocity.squared_deviation", [1, -1, 1], "with count and squares >= 0"),
+    ("shards.0.statistics.velocity.count", -1, "must be at most 1e15 in size, with count"),
     # names and hashes become paths: what could lead elsewhere is refused
     ("shards.0.name", "../../etc/passwd", r"jsonl\.name must be a plain file name"),
     ("shards.0.name", ".lock", r"jsonl\.name must be a plain file name"),

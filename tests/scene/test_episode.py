@@ -95,6 +95,7 @@ BROKEN_FIELDS: list[tuple[dict[str, Any], str]] = [
     ({"material_N": np.full(5, 4, np.uint8)}, r"material must be 0 to 3 \(.*\), got 4"),
     ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be from 1e-9 to 1e9"),
     ({"domain_size": (1.0, 0.0, 1.0)}, r"domain_size\[1\] must be from 1e-9 to 1e9"),
+    ({"gravity": (0.0, 1e300, 0.0)}, r"gravity\[1\] must be at most 1e15 in size"),
     ({"gravity": (0.0, float("inf"), 0.0)}, r"gravity\[1\] must be finite"),
     ({"material_parameters": {"e": np.zeros(4, np.float32)}}, "parameter_e must have shape"),
     ({"material_parameters": {"a.b": np.zeros(5, np.float32)}}, "parameter names must be"),
