@@ -71,14 +71,23 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored
     tensors = {}
     for name, tensor in network.state_dict().items():
         rounded = stored_precision == "fp16" and not name.startswith("normaliser.")
-        stored = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
-        wrong = stored[~stored.isfinite()][:1].tolist()
-        rule = f"finite in {'fp16' if rounded else 'fp32'}"
-        require(not wrong, f"weights tensor {name}", rule, sum(wrong))
-        tensors[name] = stored
+        tensors[name] = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
+    require_finite(tensors, "weights")
     payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
     make_folder(path.parent)
     write_atomically(path, payload)
+
+
+def require_finite(tensors: Mapping[str, torch.Tensor], field: str, path: Path | None = None) -> None:
+    """Raises ConfigError naming a tensor with a number that is not finite. `path` is the file that contains it."""
+    # a sum takes a tenth of the time of isfinite; the sum of large numbers may be infinite too
+    if bool(torch.stack([tensor.sum(dtype=torch.float32) for tensor in tensors.values()]).isfinite().all()):
+        return
+    remedy = f"{path} is damaged or of a training that diverged; take another" if path else ""
+    for name, tensor in tensors.items():
+        wrong = tensor[~tensor.isfinite()][:1].tolist()
+        precision = "fp16" if tensor.dtype == torch.float16 else "fp32"
+        require(not wrong, f"{field} tensor {name}", f"finite in {precision}", sum(wrong), remedy=remedy)
 
 
 def shipped_weights() -> dict[str, Path]:
@@ -138,7 +147,9 @@ def load_weights(
     if version != FORMAT_VERSION:
         raise ConfigError(f"{field} format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
     info = from_mapping(WeightsInfo, current_names(with_step(mapping)), "weights")
-    return network_with(info.network, info.step, tensors, path=path, field=field).to(device).eval(), info
+    network = network_with(info.network, info.step, tensors, path=path, field=field)
+    require_finite(network.state_dict(), field, path)
+    return network.to(device).eval(), info
 
 
 def network_with(

@@ -82,10 +82,10 @@ class Place:
             network = network_of(torch.float32, materials=materials)
         save_weights(path, network, replace(info, network=network.config, **changes))
 
-    def checkpoint(self, change):
-        """A file of torch.save beside the run's checkpoint."""
+    def checkpoint(self, change, part="hgn"):
+        """A file of torch.save beside the run's checkpoint, of which a part is another."""
         checkpoint = torch.load(self.path("run/checkpoints/last.ckpt"), weights_only=True)
-        change(checkpoint["hgn"])
+        change(checkpoint[part])
         torch.save(checkpoint if checkpoint["hgn"] else {"state_dict": {}}, self.path("foreign.ckpt"))
 
     def network(self, **changes):

@@ -1,6 +1,7 @@
 """Bad input to the commands: one line that says what is wrong, a non-zero exit code, and nothing touched."""
 
 import json
+import math
 import os
 import subprocess
 from pathlib import Path
@@ -161,6 +162,11 @@ def of(method, *arguments, **options):
     return lambda place: getattr(place, method)(*arguments, **options)
 
 
+def spoil(tensors):
+    for tensor in tensors.values():
+        tensor.fill_(math.nan)
+
+
 MESH = of("edit_scene", "shape: cone, size: 0.3", "mesh: points.obj")
 STEPS = [*EVALUATE, "rollout_frames=0"]
 CUT_RUN, OF_RUN = of("damage_run", truncate), [OF_THE_RUN, EXPORT[1]]
@@ -179,6 +185,14 @@ FILES = [
     ("export", EXPORT, of("checkpoint", dict.clear), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
     ("export", EXPORT, of("network", wings=2), "got foreign.ckpt: network.wings is not a known key; "),
     ("export", EXPORT, of("network", width=16), "got foreign.ckpt: checkpoint tensor "),
+    ("export", EXPORT, of("checkpoint", spoil, part="state_dict"), "must have finite numbers, each stored"),
+    *(
+        ("export", EXPORT, of("checkpoint", lambda ours, new=new: ours["data"].update(new)), f"data.{message}")
+        for new, message in (
+            ({"gravity": [0, 1e300, 0]}, "gravity[1] must be at most 1e15 in size, got 1e+300"),
+            ({"own_ranges": {"friction": [2, 1]}}, "own_ranges.friction must be from -1e15 to 1e15, the smaller one f"),
+        )
+    ),
     *((*call, RATE, RATES) for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
     *((*call, SNOW, "one of the network's (snow), got ") for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
     ("evaluate", STEPS, of("weights", gravity=(0.0, -1.6, 0.0)), "gravity must be the weights' (0.0, -1.6, 0.0)"),

@@ -1,6 +1,7 @@
 """Inference weights: what comes out is what went in, and every file that is not ours is refused."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,6 +100,33 @@ def network(**changes):
     return lambda file: rewrite(file, lambda tensors, mapping: mapping["network"].update(changes))
 
 
+def stored(name, value, kind=torch.float32):
+    """The first number of a tensor is another one."""
+
+    def change(tensors, _):
+        tensors[name] = tensors[name].to(kind)
+        tensors[name].view(-1)[0] = value
+
+    return lambda file: rewrite(file, change)
+
+
+def info(**changes):
+    return lambda file: rewrite(file, lambda tensors, mapping: mapping.update(changes))
+
+
+def inserted(before, text):
+    """A text in the header, whose length is adjusted."""
+
+    def change(file):
+        data = file.read_bytes()
+        head, rest = data[8 : 8 + int.from_bytes(data[:8], "little")], data[8 + int.from_bytes(data[:8], "little") :]
+        assert head.count(before) == 1
+        head = head.replace(before, text + before)
+        file.write_bytes(len(head).to_bytes(8, "little") + head + rest)
+
+    return change
+
+
 def cut(kept):
     return lambda file: file.write_bytes(file.read_bytes()[: int(kept * file.stat().st_size)])
 
@@ -139,6 +167,26 @@ def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
          "weights tensor surplus.weight must have shape"),
         (lambda file: rewrite(file, lambda tensors, _: tensors.pop("embedding.weight")),
          "weights tensor embedding.weight must have shape"),
+        *((stored("embedding.weight", value, kind),
+           rf"tensor embedding.weight must be finite in fp32, got {got}; .*weights.safetensors is .*; take another")
+          for value, kind, got in ((math.nan, torch.float32, "nan"), (math.inf, torch.float16, "inf"),
+                                   (-math.inf, torch.bfloat16, "-inf"), (1e300, torch.float64, "inf"))),
+        (stored("normaliser.velocity_std", math.nan), "tensor normaliser.velocity_std must be finite in fp32, got nan"),
+        *((info(**{name: value}), rf"weights\.{name}{at} must be {rule}, got {got}")
+          for name, value, at, rule, got in (
+              ("updates", -1, "", "a finite number >= 0", "-1"),
+              ("gravity", [0, 1e300, 0], r"\[1\]", "at most 1e15 in size", "1e.300"),
+              ("gravity", [0, 0, math.nan], r"\[2\]", "finite", "nan"),
+              ("frame_rate_hz", 0, "", "from 1e-9 to 1e9", "0"),
+              ("obstacle_cell_size", math.nan, "", "from 1e-9 to 1e9", "nan"),
+              ("maximum_initial_speed", -1, "", "a finite number >= 0", "-1"),
+              *(("own_ranges", {"moving": [0, 1], "friction": ends}, r"\.friction", ".* the smaller one first", r"\(")
+                for ends in ([2, 1], [math.nan, 1], [0, math.nan], [0, 1e300], [-math.inf, 1])))),
+        (inserted(b'"hgn":', b'"hgn":"{}",'), "must be a safetensors file, got .*: the key hgn is given twice"),
+        (inserted(b'"embedding.weight":', b'"embedding.weight":{"dtype":"F32","shape":[0],"data_offsets":[0,0]},'),
+         "must be a safetensors file, got .*: the key embedding.weight is given twice"),
+        (structure('{"format_version": 1, "format_version": 1}'),
+         "must declare their structure as JSON, got .*: the key format_version is given twice"),
     ],
 )  # fmt: skip
 def test_what_is_no_such_file_is_refused(weights, change, message):
