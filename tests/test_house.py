@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_028,
     "datagen": 8_929,
     "tools": 6_344,
-    "tests": 34_967,
+    "tests": 34_972,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

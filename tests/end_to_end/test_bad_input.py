@@ -152,7 +152,7 @@ def test_values(untouched, command, arguments, message, capsys, monkeypatch):
     """Unknown keys, wrong types, negative and NaN numbers, unknown materials, missing files and settings of another run
     are named."""
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    if "to resume" in message or (message.startswith("holds another") and command == "train"):
+    if "to resume" in message or (message.startswith("contains another") and command == "train"):
         arguments = untouched.train(*arguments)
     check(untouched, command, arguments, message, capsys, monkeypatch)
 
@@ -182,7 +182,12 @@ FILES = [
     ("train", "other", of("damage", "train", truncate), " bytes, got "),
     ("train", "run", CUT_RUN, "checkpoint must be a complete checkpoint file, got"),
     ("export", OF_RUN, CUT_RUN, "checkpoint must be a complete checkpoint file, got"),
-    ("export", EXPORT, of("checkpoint", dict.clear), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
+    (
+        "export",
+        EXPORT,
+        of("checkpoint", dict.clear),
+        "checkpoint must be a file of python -m hgn.train, got foreign.ckpt",
+    ),
     ("export", EXPORT, of("network", wings=2), "got foreign.ckpt: network.wings is not a known key; "),
     ("export", EXPORT, of("network", width=16), "got foreign.ckpt: checkpoint tensor "),
     ("export", EXPORT, of("checkpoint", spoil, part="state_dict"), "must have finite numbers, each stored"),
