@@ -183,6 +183,11 @@ def network_with(
                 f"{field} tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
                 f"got {_shape(shape)} in {path}; these are the weights of another network"
             )
+    for name in ("normaliser.velocity_std", "normaliser.acceleration_std"):
+        smallest = float(tensors[name].min())
+        require(
+            not smallest <= 0, f"{field} tensor {name}", "above 0", smallest, remedy=f"{path} is damaged; export again"
+        )
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     return network
 

@@ -172,6 +172,8 @@ def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
           for value, kind, got in ((math.nan, torch.float32, "nan"), (math.inf, torch.float16, "inf"),
                                    (-math.inf, torch.bfloat16, "-inf"), (1e300, torch.float64, "inf"))),
         (stored("normaliser.velocity_std", math.nan), "tensor normaliser.velocity_std must be finite in fp32, got nan"),
+        *((stored(f"normaliser.{name}_std", value), f"tensor normaliser.{name}_std must be above 0, got {value}")
+          for name, value in (("velocity", 0.0), ("acceleration", -0.5))),
         *((info(**{name: value}), rf"weights\.{name}{at} must be {rule}, got {got}")
           for name, value, at, rule, got in (
               ("updates", -1, "", "a finite number >= 0", "-1"),
