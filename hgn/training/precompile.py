@@ -1,10 +1,10 @@
 """Compiles the kernels of a training's updates before they are needed, in child processes.
 
 Triton compiles a kernel at its first launch, one kernel after the other, in a second or more each. This takes a minute
-before a training's first update. The children run this module and fill Triton's cache on disk. Updates make their
-launches on tensors without memory, so no second list of kernels and variants exists. The tensors' sizes are guesses, on
-which few variants depend. Other variants are compiled at their first launch. Simulations compile their kernels in
-threads (hgn.kernels.triton_compat) before their first frame.
+before a training's first update. The children run this module and fill Triton's cache on disk. Updates, and pushforward
+simulations before the first update, make their launches on tensors without memory, so no second list of kernels and
+variants exists. The tensors' sizes are guesses, on which few variants depend. Other variants are compiled at their
+first launch. Other simulations compile their kernels in threads (hgn.kernels.triton_compat) before their first frame.
 """
 
 import contextlib
@@ -20,10 +20,18 @@ from typing import Self
 import torch
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig
+from hgn.kernels.grid.op import Window
+from hgn.kernels.moving import MovingTable
+from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.triton_compat import Launches, compile_launches, noted_launches, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.network.elastic import RestShape
+from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.triton_stepper import TritonStepper
+from hgn.scene.material import INPUT_PARAMETERS
 from hgn.schema import from_mapping, to_mapping
+from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.system.machine import available_cpus
 from hgn.system.processes import Program, last_message
 
@@ -44,6 +52,8 @@ class PrecompileJob:
     particles: int  # approximate number of particles in an update
     cells: tuple[int, ...]  # approximate number of cells on each level
     capability: int  # capability of the GPU: 90 for an H100
+    pushforward_scenes: int = 0  # number of scenes that pushforward simulates together; 0: none
+    step: StepConfig = UNCONSTRAINED  # constraints of these simulations
 
 
 def launches_of(job: PrecompileJob, device: str = "meta") -> Launches:
@@ -60,7 +70,55 @@ def launches_of(job: PrecompileJob, device: str = "meta") -> Launches:
         if "moving" in job.network.own_physics:
             updates.allocate_moving(1)
             updates.launches()
+        if job.pushforward_scenes > 0:
+            ratio = job.pushforward_scenes / job.settings.scenes
+            particles, *cells = (round(ratio * count) for count in (job.particles, *job.cells))
+            simulation_launches(
+                network, job.step, job.precision, tuple(cells), scenes=job.pushforward_scenes, particles=particles
+            )
     return launches
+
+
+class _Unplaced(TritonStepper):
+    """A simulation whose particles have no positions."""
+
+    def _window(self) -> Window:
+        return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
+
+
+def simulation_launches(
+    network: HierarchicalGraphNetwork,
+    step: StepConfig,
+    precision: str,
+    cells: tuple[int, ...],
+    *,
+    scenes: int,
+    particles: int,
+) -> TritonStepper:
+    """Makes the launches of a simulation's frame, first without moving obstacles. Returns the simulation."""
+    config, own, device = network.config, network.config.own_physics, network.normaliser.acceleration_std.device
+    with device:
+        # one particle a cell, so that no cell is crowded
+        position_N3 = config.cell_size * torch.arange(particles)[:, None].expand(-1, 3)
+        state = ParticleState(
+            position_N3=position_N3,
+            velocity_NM3=torch.zeros(particles, config.velocity_history, 3),
+            material_N=torch.zeros(particles, dtype=torch.int32),
+            scene_N=torch.zeros(particles, dtype=torch.int64),
+            domain_S3=torch.zeros(scenes, 3),
+            gravity_S3=torch.zeros(scenes, 3),
+            obstacles=None,
+            wall_friction_S3=torch.zeros(scenes, 3) if "friction" in own else None,
+            parameter_NP=torch.zeros(particles, len(INPUT_PARAMETERS)) if "parameters" in own else None,
+            rest=RestShape.none(position_N3) if "elastic" in own else None,
+        )
+    obstacles = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, 1.0) if config.obstacle_features else None
+    stepper = _Unplaced(network, state, precision, cells, obstacles=obstacles, step=step)
+    stepper.frame_launches()
+    if "moving" in own:
+        stepper.moving = MovingTable(stepper.frame, 1, scenes, layers=1, cell_size=1.0)
+        stepper.frame_launches()
+    return stepper
 
 
 def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
@@ -76,6 +134,8 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         particles=training.batch_scenes * particles,
         cells=tuple(training.batch_scenes * count for count in cells),
         capability=10 * capability[0] + capability[1],
+        pushforward_scenes=training.pushforward_scenes if training.pushforward_fraction > 0 else 0,
+        step=config.step.in_training,
     )
 
 

@@ -57,3 +57,12 @@ def test_the_launches_are_those_of_an_update(warm_python, tmp_path):
     assert list(tmp_path.glob("*/*.cubin"))
     forwards, backwards = (part.split("\n") for part in text.split("\n\n"))
     assert len(forwards) > 30 and forwards == backwards[::-1]
+
+
+def test_a_training_with_pushforward_launches_only_kernels_compiled_ahead(warm_python, tmp_path):
+    """An update and a simulation of episodes with friction, parameters, elastic bodies and moving obstacles."""
+    lines = run_compiled(warm_python, tmp_path, "training/needed_program.py").splitlines()
+    assert len(lines) == 6
+    for line in lines:
+        update, both = map(int, re.findall(r": (\d+) (\d+)", line)[0])
+        assert 45 < update < both - 10 and line.endswith(f": {update} {both} |"), line
