@@ -130,7 +130,8 @@ def build_hierarchy(
         parent_key, parent_C = unique(pack(scene_C, coordinate_C3 >> 1))
         if body_C is not None:
             owned, parent_C = unique(parent_C * finest_count + body_C)
-            parent_key, body_C = parent_key[torch.div(owned, finest_count, rounding_mode="floor")], owned % finest_count
+            parent = torch.div(owned, finest_count, rounding_mode="floor")
+            parent_key, body_C = parent_key[parent], owned - finest_count * parent  # ONNX has no % by a size
         octant_C = ((coordinate_C3 & 1) * torch.tensor([4, 2, 1], device=key_C.device)).sum(-1)
         built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant_C))
         key_C = parent_key

@@ -190,11 +190,23 @@ def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
     tell(1.0)
     import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
     assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train")] == own
-    if one_each:
-        tell(2.0)
-        message = r"sim_0.h5: gravity must agree with free flight, .* got \[0.0, -1.0,"
-        with pytest.raises(ConfigError, match=message):
-            import_trajectories.main(options(tmp_path / "other", source, gravity=None))
+    tell(2.0)
+    message = r"(sim_0.h5|00000): gravity must agree with free flight, .* got \[0.0, -1.0,"
+    with pytest.raises(ConfigError, match=message):
+        import_trajectories.main(options(tmp_path / "other", source, gravity=None))
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.05, -1.0, 10.0])
+def test_a_gravity_that_the_flights_contradict_is_refused(factor, tmp_path):
+    """As one that was copied from another set. Zero, a set without gravity, is accepted; so is that of the settings."""
+    gravity = [0.0, factor * -0.5, 0.0]
+    source = write(tmp_path / "foreign", "plain", flights((0.0, -0.5, 0.0)), metadata(gravity=gravity))
+    if factor not in (0.0, 1.05):
+        with pytest.raises(ConfigError, match=r"gravity must agree with free flight, .* instead of \[0.0, -0.5, 0.0\]"):
+            import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
+    given = None if factor in (0.0, 1.05) else gravity
+    import_trajectories.main(options(tmp_path / "mine", source, gravity=given))
+    assert Manifest.load(tmp_path / "mine").config["imported"]["gravity"] == gravity
 
 
 def test_what_published_files_have(tmp_path):

@@ -42,5 +42,5 @@ def test_the_card_lists_shares_and_ranges(make_config, make_dataset):
     scene = SceneConfig(domain_size=(2.0, 1.5, 1.5), kinds=KINDS)
     folder = make_dataset(replace(make_config(training_scenes=1), scene=scene))
     card = data_card(Manifest.load(folder), "name", "mit")
-    assert "| kind pool | 75.0%; depth 0.03 to 0.16, tilt 0 to 0.13, size" in card
+    assert "| kind pool | 75.0%; depth 0.03 to 0.16, tilt 0 to 0.42, size" in card
     assert "| kind edge | 25.0%; plate 0.2 to 0.45" in card and "jet" not in card

@@ -242,5 +242,5 @@ def test_gradients_of_a_rollout_by_physics():
     for (name, value), gradient in zip(own.items(), gradients, strict=True):
         ends = [simulator.differentiable(scene, 3, **own | {name: value.detach() + s})[-1].sum() for s in (1e-5, -1e-5)]
         assert float((ends[0] - ends[1]).detach()) / 2e-5 == pytest.approx(float(gradient.sum()), rel=1e-4)
-    with pytest.raises(ConfigError, match=r"physics must be of the network's inputs \(none\), got 'wall_friction'"):
+    with pytest.raises(ConfigError, match=r"physics must be one of the network's inputs \(none\), got 'wall_friction'"):
         Simulator(network_of(inputs="relative"), 60.0, "torch").differentiable(scene, 2, wall_friction=walls_3)

@@ -40,7 +40,7 @@ TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
 # At its walls random states begin, or end, for some particles, and their ways meet the triangles below.
 WALLED = {"wall_clearance": (0.1, 0.7)}
-OWN = WALLED | {"inputs": "local", "own_physics": OWN_PHYSICS, "materials": MATERIALS, "levels": 2}
+OWN = WALLED | {"inputs": "local", "own_physics": OWN_PHYSICS, "materials": MATERIALS, "levels": 3}
 OWN = OWN | {"obstacle_distance": True}
 WHOLE = WALLED | {"inputs": "relative", "rest_threshold": 0.3, "obstacle_clearance": 1e-3, "levels": 1}
 SIZES = [(particles, obstacles) for particles in (1, 216, 3_000) for obstacles in (True, False)]

@@ -42,7 +42,7 @@ def import_set(
     info = set_info(source, find_format(source, config.format), config)
     first = list(itertools.islice(read_split(source, "train", info), LOOKED_AT))
     require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
-    gravity = info.gravity or _gravity(first, info)
+    gravity = _gravity(first, info, known=config.gravity is not None)
     still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
     converter = Converter(info, gravity, config.history, obstacle_cell_size(info, still))
     del first, still
@@ -78,13 +78,18 @@ def import_set(
     return manifest, converter.note_on_bounds(sum(requested.values()))
 
 
-def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
-    """Returns the gravity estimated from trajectories that do not store theirs, else that of the first trajectory."""
-    without = [trajectory for trajectory in first if trajectory.gravity is None]
-    if without:
-        return _estimated(without, info)
-    for trajectory in first if info.format == "neuralmpm" else ():  # the units of neuralmpm are not documented
-        stored_3 = np.array(trajectory.gravity)
+def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float, ...]:
+    """Returns the gravity of the set, or that of the first trajectory, or else an estimate.
+
+    Raises: ConfigError if particles in free flight contradict it, unless it is `known` from the settings.
+    """
+    stored = [gravity for trajectory in first if (gravity := info.gravity or trajectory.gravity)]
+    if len(stored) < len(first):
+        return _estimated([trajectory for trajectory in first if trajectory.gravity is None], info)
+    for trajectory, gravity in zip(first, stored, strict=True):
+        stored_3 = np.array(trajectory.gravity or gravity)
+        if known or not stored_3.any():
+            continue
         try:
             estimated_3 = np.array(_estimated([trajectory], info))
         except ConfigError:  # too few particles are in free flight
@@ -94,8 +99,7 @@ def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
                 f"{trajectory.name}: gravity must agree with free flight, in length per second squared, got "
                 f"{stored_3.tolist()} instead of {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
             )
-    assert first[0].gravity is not None
-    return first[0].gravity
+    return stored[0]
 
 
 def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
