@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig
-from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
+from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, Port, Positive, from_mapping, require, require_bounds
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
@@ -70,8 +70,9 @@ def play_page(config: PlayConfig) -> Any:
     path = find_scene(config.scene)
     scene = load_scene(path)  # before PyTorch and the weights, so that a mistake in it is answered early
     with loading():
+        from hgn.runtime.notes import note_on_speed, notes_on_scene
         from hgn.runtime.simulator import Simulator
-        from hgn.runtime.weights import shipped_weights
+        from hgn.runtime.weights import find_weights, shipped_weights
         from hgn.system.device import choose_device
         from hgn.viewer.page import PlayPage
         from hgn.viewer.session import PlaySession
@@ -83,7 +84,8 @@ def play_page(config: PlayConfig) -> Any:
 
     simulator = load(config.weights)
     print(simulator.backend.note, file=sys.stderr)
-    for note in notes_on_files(scene):
+    about = simulator.info, find_weights(config.weights).stem
+    for note in (*notes_on_scene(scene, *about), *note_on_speed(scene.velocity_N3, *about)):
         print(note, file=sys.stderr)
     most = config.particles or max(8_000 if place.type == "cpu" else 40_000, scene.particle_count)
     session = PlaySession(simulator, scene, path.parent, most, config.keep_mb << 20, config.weights)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,10 +22,10 @@ from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfi
 from hgn.render import PLY_ENDING
 from hgn.scene.distance import fraction_inside, outside_domain
 from hgn.scene.emission import entry_frames
-from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
+from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
+from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import (
     ConfigError,
     FrameCount,
@@ -49,7 +49,6 @@ PICTURES = 4  # number of pictures in the PNG
 EVERY = 3  # smallest number of frames of the rollout for one picture of the GIF
 FASTEST = 50  # largest number of pictures per second that viewers of GIFs show
 REPORTED = 0.01  # smallest fraction of particles inside obstacles, or beyond the domain, that is reported
-SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; velocities are stored in float32
 
 
 @dataclass(frozen=True)
@@ -127,6 +126,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     """
     with loading():
         from hgn.render.exchange import require_exchange, save_frames
+        from hgn.runtime.notes import note_on_speed, notes_on_scene
         from hgn.runtime.simulator import InitialState, Simulator
         from hgn.runtime.weights import find_weights, require_frame_rate
         from hgn.scene.episode_obstacles import obstacles_of_episode
@@ -141,12 +141,12 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     source: dict[str, str | int] = {"weights": weights.name, "weights_sha256": digest}
     frames = config.frames
     reference_TN3 = scene = None
-    notes: list[str] = []
+    notes: Iterable[str] = ()
     if config.data is None:
         scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
-        notes = [*notes_on_files(scene), *_notes_on_physics(scene, simulator.info, weights.stem)]
+        notes = notes_on_scene(scene, simulator.info, weights.stem)
         source["scene"] = config.scene or f"random, seed {config.random_seed}"
     else:
         from hgn.data.reader import find_episode
@@ -160,18 +160,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(printable(config.data)).name, "episode": str(config.episode)}
     simulated = simulator.frames(initial, frames)  # before all notes, because it refuses unsupported scenes
-    for note in notes:
+    for note in (*notes, *note_on_speed(initial.velocity_N3, simulator.info, weights.stem)):
         print(note, file=sys.stderr)
-    limit, relative = simulator.info.maximum_initial_speed, simulator.info.network.relative
-    fastest = float(np.linalg.norm(initial.velocity_N3.astype(np.float64), axis=-1).max(initial=0.0))
-    if not (relative and limit is None) and fastest > (limit or 0.0) * (1 + SAME_SPEED):
-        known = "an unknown speed; " if limit is None else f"up to {limit:g}; beyond that "
-        flight = "motion is unreliable, but free flight is exact with weights=own_physics"
-        print(
-            f"velocity: groups start with up to {fastest:.3g} domain units per second, in the data of {weights.stem} "
-            f"with {known}{'collisions and contacts are unreliable' if relative else flight}",
-            file=sys.stderr,
-        )
     print(simulator.backend.note, file=sys.stderr)
     material_N = initial.material_N if scene is None else scene.material_N
     path_TN3 = np.full((frames, len(material_N), 3), np.nan, np.float32)
@@ -205,24 +195,6 @@ def _shown(simulated: Iterator[np.ndarray], count: int, weights: Path) -> Genera
                 progress.update()
         except DivergedError as error:
             raise ConfigError(f"weights must simulate without divergence, got {weights}: {error}") from error
-
-
-def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[str]:
-    """Yields a line for settings of the scene that only the solver uses, and for values outside those of the data."""
-    inputs = info.network.own_physics
-    used = INPUT_PARAMETERS if "parameters" in inputs else ()
-    if unused := ", ".join(name for name in scene.material_parameters if name not in used):
-        yield f"no effect: {unused} of groups; {weights} simulates each material with the solver's constants"
-    frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
-    if frictions.any() and "friction" not in inputs:
-        yield f"no effect: friction of surfaces; {weights} has that of its data, and own_physics has it as input"
-    speeds = np.array([obstacle.motion.fastest(obstacle.vertex_V3) for obstacle in scene.obstacles if obstacle.motion])
-    for name, (low, high) in info.own_ranges.items():
-        own = {"friction": frictions, "moving": speeds}
-        values = own.get(name, scene.material_parameters.get(name, np.zeros(0)))
-        far = values[(values < low * (1 - SAME_SPEED)) | (values > high * (1 + SAME_SPEED))]
-        if len(far) and name in (*used, *inputs):
-            yield f"{name}: {far[0]:.4g}, the data of {weights} have {low:g} to {high:g}; motion is unreliable"
 
 
 def _out(config: RolloutConfig) -> Path:

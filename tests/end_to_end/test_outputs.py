@@ -123,6 +123,18 @@ def test_a_page_is_closed_by_signals(number, capsys, monkeypatch):
     assert capsys.readouterr() == (f"{Page.address}\nclosed\n", "" if normal else "error: interrupted\n")
 
 
+def test_the_page_says_what_weights_do_not_know(tmp_path, capsys, monkeypatch):
+    """As hgn.rollout does: ignored friction, and a faster throw than those of the data."""
+    pages = pytest.importorskip("hgn.viewer.page", reason="viser is not installed: pip install 'hgn[play]'")
+    monkeypatch.setattr(pages, "PlayPage", lambda *given: given)
+    group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, velocity: [2.7, 0, 0]}"
+    (tmp_path / "rough.yaml").write_text(f"floor_friction: 0.6\ngroups: [{group}]\n")
+    play.play_page(play.PlayConfig(scene=str(tmp_path / "rough.yaml"), weights="obstacles_small", device="cpu"))
+    said = capsys.readouterr().err
+    assert "no effect: friction of surfaces; obstacles_small has that of its data" in said
+    assert "velocity: groups start with up to 2.7 domain units per second, in the data of obstacles_small" in said
+
+
 @pytest.mark.parametrize(
     ("name", "number"), [("a.vtkhdf", signal.SIGINT), ("a.vtkhdf", signal.SIGTERM), ("a.ply", signal.SIGHUP)]
 )

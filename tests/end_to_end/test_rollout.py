@@ -110,13 +110,14 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     obstacles = "{shape: square, size: 0.1, position: [0.8, 0.2, 0.5], friction: 0.2}, {mesh: open.obj}"
     obstacles += ", {mesh: open.obj, scale: 200, position: [500, 0, 0]}, {mesh: open.obj, scale: 0.01}"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, youngs_modulus_pa: 1e5}"
-    (tmp_path / "stiff.yaml").write_text(f"groups: [{group}]\nobstacles: [{obstacles}]\n")
+    (tmp_path / "stiff.yaml").write_text(f"particles_per_cell: 4\ngroups: [{group}]\nobstacles: [{obstacles}]\n")
     out = str(tmp_path / "a.vtkhdf")
     assert rollout.main({"weights": weights, "frames": 2, "scene": str(tmp_path / "stiff.yaml"), "out": out}) == 0
     said = capsys.readouterr().err
     assert "no effect: youngs_modulus_pa of groups; still simulates each material with the solver's" in said
     assert "a sheet, not a solid, because it is not watertight: open.obj; close its" in said and "square" not in said
     assert "no effect: friction of surfaces; still has that of its data, and own_physics has it as input" in said
+    assert "particles_per_cell: 4, shipped weights were trained with 8; motion is unreliable" in said
     assert said.count("outside the domain, out of reach of particles: open.obj (x 540 to 580, y 40 to 40") == 1
     assert said.endswith(f"\nrender=true also draws it, or python -m tools.render rollout={out} out=pictures\n")
     assert said.count("smaller than a cell of 0.0156: open.obj (x 0.002 to 0.004, ") == 1
