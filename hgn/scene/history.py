@@ -39,6 +39,14 @@ def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history
     return (velocity_N3[:, None].astype(np.float64) - age_H1 * np.asarray(gravity_3, np.float64)).astype(np.float32)
 
 
+def velocity_after(displacement_N3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
+    """Returns the velocity at the end of a frame of free flight, float64 [N, 3]: the inverse of ballistic_velocities.
+
+    Units: domain units per frame (squared).
+    """
+    return displacement_N3 + 0.5 * np.asarray(gravity_3, np.float64)
+
+
 def frames_before(episode: Episode, first: int) -> np.ndarray:
     """Returns the frames `first` (negative) to -1 of an episode, float32 [-first, N, 3].
 

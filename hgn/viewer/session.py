@@ -19,6 +19,7 @@ from hgn.runtime.live import LiveSimulation
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count
+from hgn.scene.history import velocity_after
 from hgn.scene.material import MATERIALS, material_index
 from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
@@ -73,6 +74,7 @@ class PlaySession:
         self.maximum_particles, self.keep_bytes = maximum_particles, keep_bytes
         self.particles_per_cell = scene.particles_per_cell or 8.0
         self.random = np.random.default_rng(scene.seed)
+        self._constants = scene.material_parameters  # of the first particles; those that enter later have none
         self.spout: Spout | None = None
         self._owed = 0.0  # fraction of a particle that the spout has yet to release
         self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
@@ -130,6 +132,12 @@ class PlaySession:
     @property
     def gravity(self) -> Vector:
         return self.live.scenes[0].gravity
+
+    def _velocities(self) -> np.ndarray:
+        """Returns velocities at the instant of the newest frame, float32 [N, 3] in domain units per second."""
+        rate, newest = self.simulator.frame_rate_hz, self.newest
+        velocity_N3 = rate * velocity_after(newest.velocity_N3, np.array(newest.gravity) / rate**2)
+        return velocity_N3.astype(np.float32)
 
     def step(self) -> None:
         """Simulates one frame, after the particles of the spout have entered.
@@ -323,8 +331,7 @@ class PlaySession:
         rate = self.simulator.frame_rate_hz
         require(simulator.frame_rate_hz == rate, "weights", f"of {rate} frames a second", simulator.frame_rate_hz)
         newest, history_NM3 = self.newest, self.recording.history(self.frame)
-        velocity_N3 = newest.velocity_N3 * np.float32(rate)
-        now = replace(self.live.scenes[0], position_N3=newest.position_N3, velocity_N3=velocity_N3)
+        now = replace(self.live.scenes[0], position_N3=newest.position_N3, velocity_N3=self._velocities())
         live = LiveSimulation(simulator, replace(now, material_N=self.materials()), self.maximum_particles)
         if live.state.velocity_NM3.shape[1] == history_NM3.shape[1]:
             live.restore(newest.position_N3, history_NM3, self.frame)
@@ -336,23 +343,27 @@ class PlaySession:
     # saved files
 
     def scene_archive(self) -> bytes:
-        """Returns the present scene: a zip of `scene.yaml`, a file of particles for each material, and the meshes.
+        """Returns the present scene: a zip of `scene.yaml`, files of particles, and the meshes.
 
+        Particles of one material with equal constants are one group.
         Raises ConfigError without particles, because a scene file needs at least one.
         """
         require(len(self.newest.position_N3) > 0, "scene's particles", "at least one to be saved", 0, "pour some")
-        newest, rate = self.newest, self.simulator.frame_rate_hz
-        groups, obstacles, files = [], [], {}
-        for index, name in enumerate(MATERIALS):
-            mine_N = self.materials() == index
-            if not mine_N.any():
-                continue
+        groups: list[dict[str, object]] = []
+        obstacles, files = [], {}
+        position_N3 = np.clip(self.newest.position_N3, 0, np.array(self.domain_size, np.float32))
+        velocity_N3, none_N = self._velocities(), np.full(len(position_N3), -1, np.float32)  # constants are never < 0
+        columns = (np.append(np.nan_to_num(own, nan=-1), none_N[len(own) :]) for own in self._constants.values())
+        row_NC = np.stack([self.materials(), *columns], axis=1)
+        for row_C in np.unique(row_NC, axis=0):
+            mine_N, material = (row_NC == row_C).all(axis=1), MATERIALS[int(row_C[0])]
             buffer = io.BytesIO()
-            low = np.zeros(3, np.float32)
-            position_N3 = np.clip(newest.position_N3[mine_N], low, np.array(self.domain_size, np.float32))
-            np.savez_compressed(buffer, position=position_N3, velocity=newest.velocity_N3[mine_N] * np.float32(rate))
-            files[f"{name}.npz"] = buffer.getvalue()
-            groups.append({"particles": f"{name}.npz", "material": name})
+            np.savez_compressed(buffer, position=position_N3[mine_N], velocity=velocity_N3[mine_N])
+            name = f"{material}_{len(groups)}.npz"
+            files[name] = buffer.getvalue()
+            given = zip(self._constants, row_C[1:], strict=True)
+            constants = {key: float(str(value)) for key, value in given if value >= 0}  # the digits of a float32
+            groups.append({"particles": name, "material": material, **constants})
         for obstacle in self.obstacles:
             body = obstacle.body
             entry = {key: value for key, value in to_mapping(obstacle.entry).items() if value not in (None, [], ())}
@@ -361,11 +372,14 @@ class PlaySession:
                 entry["mesh"] = f"{body.name}{Path(body.entry.mesh).suffix}"
                 files[entry["mesh"]] = body.mesh_file
             obstacles.append(entry)
+        walls, floor, _ = self.live.scenes[0].wall_friction  # a scene file's side walls have one friction
         mapping = {
             "domain_size": list(self.domain_size),
             "cell_size": self.cell_size,
             "gravity": list(self.gravity),
             "particles_per_cell": self.particles_per_cell,
+            "wall_friction": walls,
+            "floor_friction": floor,
             "obstacles": obstacles,
             "groups": groups,
         }

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from network.states import network_of, silent
+from scipy.spatial import KDTree
 
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import Simulator
@@ -276,13 +277,52 @@ def test_the_scene_is_saved(session, tmp_path):
     saved = load_scene(tmp_path / "saved" / "scene.yaml")
     order_N = np.argsort(session.materials(), kind="stable")
     np.testing.assert_array_equal(saved.position_N3, session.newest.position_N3[order_N])
-    np.testing.assert_allclose(saved.velocity_N3, 60 * session.newest.velocity_N3[order_N], rtol=1e-6)
+    velocity_N3 = 60 * session.newest.velocity_N3[order_N].astype(np.float64) + np.array([1.0, -2.0, 0.5]) / 120
+    np.testing.assert_allclose(saved.velocity_N3, velocity_N3, rtol=1e-6)
     np.testing.assert_array_equal(saved.material_N, np.sort(session.materials()))
     assert saved.gravity == (1.0, -2.0, 0.5) and saved.cell_size == session.cell_size
     for found, expected in zip(saved.obstacles, session.obstacles, strict=True):
         np.testing.assert_allclose(found.vertex_V3, expected.mesh().vertex_V3, rtol=0, atol=1e-6)
     again = PlaySession(simulator(), saved, tmp_path / "saved")
     assert len(again.live.scenes[0].obstacle_grid.cell_K3) == len(session.live.scenes[0].obstacle_grid.cell_K3)
+
+
+@pytest.mark.parametrize("frames", [0, 3])
+def test_friction_constants_and_velocities_are_saved(folder, frames):
+    """The saved scene has both frictions, the constants of each particle, none of poured ones, and velocities at the
+    instant of the frame, from which a simulation starts with the displacements that the particles had."""
+    cubes = [
+        "material: sand, sand_friction_angle_deg: 40.1, density_kg_m3: 900",
+        "material: water, water_viscosity_pa_s: 3, velocity: [0.1, 0.2, 0.3]",
+        "material: sand, sand_friction_angle_deg: 20",
+        "material: sand, velocity: [0, 1, 0]",
+        "material: sand, sand_friction_angle_deg: 20",
+    ]
+    own = "floor_friction: 0.6\nwall_friction: 0.2\ncell_size: 0.03125\ngravity: [1, -2, 0.5]\ngroups:\n"
+    for number, cube in enumerate(cubes):
+        own += f"  - {{shape: cube, size: 0.05, position: [{0.2 + 0.15 * number}, 0.5, 0.5], {cube}}}\n"
+    (folder / "own.yaml").write_text(own)
+    scene = load_scene(folder / "own.yaml")
+    session = PlaySession(free_flight(), scene, folder)
+    if frames:
+        session.drop("sand", (0.5, 0.8, 0.5), 0.1)
+    steps(session, frames)
+    with zipfile.ZipFile(io.BytesIO(session.scene_archive())) as archive:
+        archive.extractall(folder / "saved")
+    saved = load_scene(folder / "saved" / "scene.yaml")
+    assert saved.wall_friction == (0.2, 0.6, 0.2) and len(saved.specification["groups"]) == 4
+    count, poured = scene.particle_count, saved.particle_count - scene.particle_count
+    assert (poured > 0) == (frames > 0)
+    row_N = KDTree(saved.position_N3).query(session.newest.position_N3)[1]
+    np.testing.assert_array_equal(saved.material_N[row_N], session.materials())
+    assert saved.material_parameters.keys() == scene.material_parameters.keys()
+    for name, value_N in scene.material_parameters.items():
+        expected_N = np.pad(value_N, (0, poured), constant_values=np.nan)
+        np.testing.assert_array_equal(saved.material_parameters[name][row_N], expected_N, err_msg=name)
+    expected_N3 = scene.velocity_N3 + np.array(scene.gravity) * frames / 60
+    np.testing.assert_allclose(saved.velocity_N3[row_N[:count]], expected_N3, rtol=0, atol=2e-6)
+    again = PlaySession(free_flight(), saved, folder / "saved")
+    np.testing.assert_allclose(again.newest.velocity_N3[row_N], session.newest.velocity_N3, rtol=0, atol=1e-8)
 
 
 def test_the_rollout_is_saved(session, tmp_path):
@@ -311,7 +351,7 @@ def test_the_rollout_is_saved(session, tmp_path):
 
 def test_other_weights_go_on_from_here(session):
     """The state is kept to the bit, histories too, and what follows is the other network's; a rate or a material that
-    does not fit is refused and nothing changes."""
+    does not fit is refused and nothing changes. A history of another length begins with the last displacement."""
     steps(session, 3)
     state = session.live.state
     with pytest.raises(ConfigError, match=r"weights must be of 60.0 frames a second, got 30.0"):
@@ -326,6 +366,9 @@ def test_other_weights_go_on_from_here(session):
     session.rewind(3)
     session.use_weights(simulator())
     assert not np.array_equal(steps(session, 1), other_N3) and session.frame == 4
+    newest_N3 = session.newest.velocity_N3
+    session.use_weights(free_flight(velocity_history=3))
+    np.testing.assert_allclose(session.live.state.velocity_NM3[:, 0], newest_N3, rtol=0, atol=1e-8)
 
 
 def test_divergence_is_taken_back(session):
