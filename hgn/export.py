@@ -91,6 +91,7 @@ def main(mapping: dict[str, Any]) -> int:
     assert weights is not None
     network, info = load_weights(find_weights(weights), device)
     moving = 0
+    arrays: dict[str, np.ndarray] = {}
     if config.arrays is not None:
         assert config.scene is not None
         simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
@@ -101,8 +102,9 @@ def main(mapping: dict[str, Any]) -> int:
         moving = len(start.moving)
         corner_F33 = barrier_pieces(all_corners(at_rest(scene.obstacles)), scene.cell_size, scene.domain_size)
         arrays = initial_arrays(network.config, simulator.start([start]), corner_F33, start.parameters)
-        write_arrays(Path(config.arrays), arrays)
-        print(config.arrays)
+        others = {file.stem for file in Path(config.arrays).glob("*.npy")}
+        rule = "a new folder, or one with the inputs of the same network"
+        require(others in (set(), set(arrays)), "arrays", rule, config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info, moving)
     if config.package is not None:  # before the ONNX export, whose symbols in the graph the compiler refuses
@@ -111,6 +113,9 @@ def main(mapping: dict[str, Any]) -> int:
     if config.onnx is not None:
         write_onnx(Path(config.onnx), program, info)
         print(config.onnx)
+    if config.arrays is not None:
+        write_arrays(Path(config.arrays), arrays)
+        print(config.arrays)
     return 0
 
 
@@ -157,8 +162,6 @@ def change_step(network: ParticleNetwork, changes: dict[str, Any]) -> None:
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> None:
     """Writes the first inputs of a step, one .npy file for each."""
-    others = {file.stem for file in folder.glob("*.npy")}
-    require(others in (set(), set(arrays)), "arrays", "a new folder, or one that HGN wrote", str(folder))
     folder.mkdir(parents=True, exist_ok=True)
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)

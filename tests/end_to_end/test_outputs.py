@@ -71,8 +71,10 @@ def test_files_of_other_programs_stay(place, command, arguments, name, capsys, m
     monkeypatch.setattr(Simulator, "load", lambda *_: pytest.fail("the simulation began"))
     before = content(place.folder)
     code, line = refused(command, place.train(*arguments) if command == "train" else arguments, capsys, monkeypatch)
-    assert code == EXIT_INPUT and "that HGN wrote, got" in line, line
-    assert name in line or name.endswith(".npy")
+    arrays = name.endswith(".npy")
+    rule = "arrays must be a new folder, or one with the inputs of the same network" if arrays else "that HGN wrote"
+    assert code == EXIT_INPUT and f"{rule}, got" in line, line
+    assert arrays or name in line
     assert content(place.folder) == before
 
 

@@ -311,6 +311,18 @@ def test_scenes_with_emitters_have_no_arrays(tmp_path):
     assert not (tmp_path / "arrays").exists()
 
 
+def test_an_export_that_fails_leaves_no_arrays(tmp_path, monkeypatch):
+    """Arrays are written last, so the same folder serves for the next network."""
+    network = network_of(torch.float32)
+    save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL))
+    monkeypatch.setattr("hgn.runtime.exported_step.traced_step", lambda *_: None)
+    monkeypatch.setattr("hgn.runtime.exported_step.write_onnx", mock.Mock(side_effect=RuntimeError("no such operator")))
+    options = {"weights": str(tmp_path / "w.safetensors"), "scene": "funnel", "onnx": str(tmp_path / "a.onnx")}
+    with pytest.raises(RuntimeError, match="no such operator"):
+        export.main(options | {"arrays": str(tmp_path / "arrays")})
+    assert not (tmp_path / "arrays").exists()
+
+
 def test_a_package_is_written_first(tmp_path, monkeypatch):
     """What writes ONNX leaves symbols in the graph, of both formats, that the compiler refuses."""
     network, written = network_of(torch.float32), []
