@@ -67,7 +67,9 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     except MissingConfigException as error:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         files = [each for each in error.options or () if "." not in each]  # without registered dataclasses
-        text = f"{group} must be a file of conf/{group}, got {name!r}; {known_keys(name, files, 'files')}"
+        known = known_keys(name, files, "files")
+        known += f"{'' if known.endswith('?') else ';'} --config-dir=DIR adds the files of DIR/{group}"
+        text = f"{group} must be a file of conf/{group}, got {name!r}; {known}"
         raise ConfigError(text if files else " ".join(str(error).split())) from error
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
