@@ -420,7 +420,8 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
 def _require_clear(name: str, position_N3: np.ndarray, obstacles: Sequence[Obstacle], file: SceneFile) -> None:
     for obstacle in (each.at(0.0) for each in obstacles):
         if inside := int(contains(position_N3, obstacle).sum()):
-            unit = "" if _reaches(obstacle, file.domain_size, file.cell_size) else f", or its scale ({MILLIMETRES})"
+            larger = (np.ptp(obstacle.vertex_V3, axis=0) >= file.domain_size).all()
+            unit = f", or its scale ({MILLIMETRES})" if larger else ""
             extents = f"particles: {extent(position_N3)}; obstacle: {extent(obstacle.vertex_V3)}"
             raise ConfigError(
                 f"{name} must be clear of closed obstacles, got {inside} of {len(position_N3)} particles inside "

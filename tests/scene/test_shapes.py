@@ -11,6 +11,7 @@ from hgn.scene.rotation import euler_rotation, quaternion_product, quaternion_ro
 from hgn.scene.scene_file import load_scene, notes_on_files
 from hgn.scene.shapes import CLOSED_SHAPES, shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
+from hgn.schema import ConfigError
 
 BOXES = {"half_box": (1, 0.5, 1), "square": (1, 0, 1), "half_sphere": (1, 0.5, 1)}  # edges; others are as wide as high
 VOLUMES = {"cone": np.pi / 12, "pyramid": 1 / 3}
@@ -89,3 +90,15 @@ def test_obstacles_that_reach_no_particle(tmp_path, changes, notes):
     (tmp_path / "a.yaml").write_text(json.dumps({"groups": [group], "obstacles": [entry]}))
     seen = notes_on_files(load_scene(tmp_path / "a.yaml"))
     assert [text.startswith(note) for text, note in zip(seen, notes, strict=True)] == [True] * len(notes)
+
+
+@pytest.mark.parametrize(("size", "named"), [(0.8, False), (300.0, True)])
+def test_meshes_in_millimetres_around_the_particles(tmp_path, size, named):
+    """The remedy names the scale of a mesh larger than the domain, also if a side of the mesh lies in the domain."""
+    trimesh.creation.box((size,) * 3).export(tmp_path / "rock.stl")
+    cube = "{shape: cube, size: 0.2, position: [0.5, 0.5, 0.5], material: water}"
+    rock = f"{{mesh: rock.stl, position: [0.5, {0.1 + size / 2}, 0.5]}}"
+    (tmp_path / "scene.yaml").write_text(f"groups: [{cube}]\nobstacles: [{rock}]\n")
+    with pytest.raises(ConfigError, match=r"got .* particles inside rock .*; move or shrink") as caught:
+        load_scene(tmp_path / "scene.yaml")
+    assert ("or its scale (a file in millimetres needs scale: 0.001)" in str(caught.value)) == named
