@@ -70,7 +70,7 @@ def main(mapping: dict[str, Any]) -> int:
     if manifest is not None and config.imported:
         require_network_fits(config, manifest)
     elif manifest is not None:
-        require_same_dataset(manifest.config, config.datagen, folder)
+        require_same_dataset(manifest.config, config.datagen, folder, "dataset.folder=...")
     others = more_data(config)
     stop = StopRequest()
     stop.listen()

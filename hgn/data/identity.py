@@ -5,6 +5,7 @@ Counts, folder, workers, device and launch size are not part of it. A data set c
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from hgn.schema import ConfigError, to_mapping
 
 # settings of the solver that change trajectories only by rounding
 _NOT_PHYSICS = ("device", "scenes_per_launch")
+_MESH_DIGEST = re.compile(r" [0-9a-f]{64}\b")  # after the name of a mesh file
 # settings of scenes that older data sets do not have; they are omitted at their defaults
 _LATER_OPTIONS = (
     "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
@@ -74,12 +76,24 @@ def identity_differences(stored: Mapping[str, Any], requested: Mapping[str, Any]
         if isinstance(left, Mapping) and isinstance(right, Mapping):
             lines += identity_differences(left, right, name)
         elif left != right:
-            lines.append(f"{name} is {left} there, {right} is requested")
+            there, here = (_MESH_DIGEST.sub("", str(value)) for value in (left, right))
+            line = f"{name} is {there} there, {here} is requested"
+            if there == here and isinstance(left, list) and isinstance(right, list):  # only the content of meshes
+                changed = [_MESH_DIGEST.sub("", str(value)) for value in right if value not in left]
+                line = f"{name}: {', '.join(changed)} was changed"
+            lines.append(line)
     return lines
 
 
-def require_same_dataset(stored: Mapping[str, Any], config: DatagenConfig, folder: object) -> None:
+def require_same_dataset(
+    stored: Mapping[str, Any],
+    config: DatagenConfig,
+    folder: object,
+    folder_keys: str = "out=... or dataset.folder=...",
+) -> None:
     """Checks that a folder's data set (its manifest's `config`) is the data set of a configuration.
+
+    `folder_keys` are the settings that name the folder.
 
     Raises: ConfigError naming the first keys that differ, and the remedy.
     """
@@ -87,6 +101,5 @@ def require_same_dataset(stored: Mapping[str, Any], config: DatagenConfig, folde
     if differences:
         shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
         raise ConfigError(
-            f"{folder} contains another data set: {shown}; choose another folder (out=... or dataset.folder=...) or "
-            "the same settings"
+            f"{folder} contains another data set: {shown}; choose another folder ({folder_keys}) or the same settings"
         )

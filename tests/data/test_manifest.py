@@ -53,6 +53,11 @@ def test_identity(make_config):
     lines = identity_differences({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 1, "c": 4}, "e": 5})
     differences = ["a.c is 2 there, 4", "d is 3 there, nothing", "e is nothing there, 5"]
     assert lines == [f"{difference} is requested" for difference in differences]
+    stored, other = ({"shapes": ["cone", "a rock.obj " + 64 * digit, "b.obj " + 64 * "a"]} for digit in "48")
+    assert identity_differences(stored, other) == ["shapes: a rock.obj was changed"]
+    assert identity_differences(stored, {"shapes": ["cone"]}) == [
+        "shapes is ['cone', 'a rock.obj', 'b.obj'] there, ['cone'] is requested"
+    ]
 
 
 def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeypatch):

@@ -35,7 +35,7 @@ VALUES = [
     ("datagen", ["colour=1"], "colour is not a known key; known keys: "),
     ("datagen", ["+colour=1"], "colour is not a known key; known keys: scene, mpm, dataset, scenes, out,"),
     ("datagen", ["+dataset.colour=1"], "dataset.colour is not a known key; known keys: folder,"),
-    ("datagen", ["scene=moon"], "scene must be a file of conf/scene, got 'moon'; did you mean motion?"),
+    ("datagen", ["scene=moon"], "got 'moon'; did you mean motion? --config-dir=DIR adds the files of DIR/scene"),
     ("datagen", ["scene=3"], "Config group override must be a string or a list. Got int"),
     ("datagen", ["progress=loud"], "progress must be one of bar, json, off, got 'loud'"),
     ("datagen", ["out=${nowhere}"], "Interpolation key 'nowhere' not found"),
@@ -143,7 +143,7 @@ VALUES = [
     # a run is not resumed under another network, noise or data set
     ("train", ["network.width=16"], "network.width must be 8 to resume"),
     ("train", ["training.noise_std=0.01"], "training.noise_std must be 0.000848528 to resume"),
-    ("train", ["dataset.frames=7"], "contains another data set: frames is 6 there, 7 is requested"),
+    ("train", ["dataset.frames=7"], "frames is 6 there, 7 is requested; choose another folder (dataset.folder=...) or"),
 ]
 
 
