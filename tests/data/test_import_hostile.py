@@ -234,7 +234,19 @@ def test_malformed_files_are_refused(name, change, message, tmp_path):
         change(source)
     with pytest.raises(ConfigError, match=message):
         import_trajectories.main(options(tmp_path / "mine", source))
-    assert not (source / "ran").exists() and not (tmp_path / "mine" / "manifest.json").exists()
+    assert not (source / "ran").exists() and not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("types", [[1, 7, 1], [1, 5, 1], None])
+def test_types_without_a_name_in_own_materials_are_refused(types, tmp_path):
+    """If metadata name materials, other numbers have no names, as DeepMind's 7 or the 1 of files without types."""
+    source = write(tmp_path / "foreign", "plain", {}, metadata(materials={"1" if types else "0": "gravel"}))
+    members = {"a/position": np.full((9, 3, 3), 0.5, np.float32)} | ({"a/particle_type": types} if types else {})
+    np.savez(source / "train.npz", **members)
+    number = types[1] if types else 1
+    with pytest.raises(ConfigError, match=rf"particle_type must have a name for each number, got \[{number}\]"):
+        import_trajectories.main(options(tmp_path / "mine", source, materials={}))
+    import_trajectories.main(options(tmp_path / "mine", source, materials={str(number): "clay"}))
 
 
 def test_a_record_without_a_feature_is_refused(tmp_path):

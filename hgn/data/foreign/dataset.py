@@ -46,14 +46,20 @@ def import_set(
     still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
     converter = Converter(info, gravity, config.history, obstacle_cell_size(info, still))
     del first, still
+    is_new = not out.exists()
     make_folder(out)
     shards: list[ShardEntry] = []
-    for split in SPLITS:
-        episodes = (
-            converter.episode(trajectory, f"{split}-{index:06d}", index)
-            for index, trajectory in enumerate(read_split(source, split, info))
-        )
-        shards += _shards(out, split, episodes, progress)
+    try:
+        for split in SPLITS:
+            episodes = (
+                converter.episode(trajectory, f"{split}-{index:06d}", index)
+                for index, trajectory in enumerate(read_split(source, split, info))
+            )
+            shards += _shards(out, split, episodes, progress)
+    except ConfigError:
+        if is_new and not any(out.iterdir()):
+            out.rmdir()
+        raise
     identity = {
         "schema_version": SCHEMA_VERSION,
         "imported": {

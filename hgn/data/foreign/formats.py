@@ -92,7 +92,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
     if name == "plain":
         named = raw.get("materials", {})
         require(isinstance(named, Mapping), f"{folder}/metadata.json: materials", "names by number", named)
-        types = types | {_number(key, folder): _material(value, folder) for key, value in named.items()}
+        types = {_number(key, folder): _material(value, folder) for key, value in named.items()} or types
         boundary = given("boundary_types", None, (None,), boundary)
     types = types | {_number(key, folder): value for key, value in config.materials.items()}
     whole = all(abs(kind) <= 1e15 and kind == int(kind) for kind in boundary)
