@@ -371,6 +371,25 @@ def test_other_weights_go_on_from_here(session):
     np.testing.assert_allclose(session.live.state.velocity_NM3[:, 0], newest_N3, rtol=0, atol=1e-8)
 
 
+def test_other_weights_go_on_with_added_particles(folder):
+    """The others keep their constants; the added ones have the defaults, and are a body of their own."""
+    text = SCENE.replace("material: snow,", "material: snow, snow_hardening: 7,")
+    (folder / "own.yaml").write_text(text)
+    physics = {"own_physics": ("parameters",)}
+    session = PlaySession(free_flight(**physics), load_scene(folder / "own.yaml"), folder)
+    first = session.live.scenes[0]
+    steps(session, 2)
+    added = session.drop("snow", (0.8, 0.8, 0.2), 0.1)
+    steps(session, 1)
+    state, before = session.live.state, len(first.material_N)
+    session.use_weights(free_flight(**physics))
+    for name in ("position_N3", "velocity_NM3", "material_N", "parameter_NP"):
+        np.testing.assert_array_equal(getattr(session.live.state, name), getattr(state, name), err_msg=name)
+    body_N = session.live.scenes[0].body_N
+    assert added and len(body_N) == before + added and set(body_N[before:]) == {first.body_N.max() + 1}
+    steps(session, 1)
+
+
 def test_divergence_is_taken_back(session):
     """What throws the scene apart is said, and the scene is as it was a frame before."""
     before_N3 = steps(session, 2)
