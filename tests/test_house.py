@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_182,
     "datagen": 8_929,
     "tools": 6_344,
-    "tests": 35_143,
+    "tests": 35_147,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

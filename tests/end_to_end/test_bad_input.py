@@ -143,7 +143,11 @@ VALUES = [
     # a run is not resumed under another network, noise or data set
     ("train", ["network.width=16"], "network.width must be 8 to resume"),
     ("train", ["training.noise_std=0.01"], "training.noise_std must be 0.000848528 to resume"),
-    ("train", ["dataset.frames=7"], "frames is 6 there, 7 is requested; choose another folder (dataset.folder=...) or"),
+    (
+        "train",
+        ["dataset.frames=7"],
+        "contains another data set: frames is 6 there, 7 is requested; choose another folder (d",
+    ),
 ]
 
 
