@@ -72,7 +72,7 @@ def play_page(config: PlayConfig) -> Any:
     with loading():
         from hgn.runtime.notes import note_on_speed, notes_on_scene
         from hgn.runtime.simulator import Simulator
-        from hgn.runtime.weights import find_weights, shipped_weights
+        from hgn.runtime.weights import shipped_weights
         from hgn.system.device import choose_device
         from hgn.viewer.page import PlayPage
         from hgn.viewer.session import PlaySession
@@ -84,7 +84,7 @@ def play_page(config: PlayConfig) -> Any:
 
     simulator = load(config.weights)
     print(simulator.backend.note, file=sys.stderr)
-    about = simulator.info, find_weights(config.weights).stem
+    about = simulator.info, Path(config.weights).stem
     for note in (*notes_on_scene(scene, *about), *note_on_speed(scene.velocity_N3, *about)):
         print(note, file=sys.stderr)
     most = config.particles or max(8_000 if place.type == "cpu" else 40_000, scene.particle_count)

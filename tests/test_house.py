@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_182,
+    "hgn": 34_180,
     "datagen": 8_929,
     "tools": 6_344,
     "tests": 35_147,

@@ -184,10 +184,8 @@ def network_with(
                 f"got {_shape(shape)} in {path}; these are the weights of another network"
             )
     for name in ("normaliser.velocity_std", "normaliser.acceleration_std"):
-        smallest = float(tensors[name].min())
-        require(
-            not smallest <= 0, f"{field} tensor {name}", "above 0", smallest, remedy=f"{path} is damaged; export again"
-        )
+        smallest, remedy = float(tensors[name].min()), f"{path} is damaged; export again"
+        require(not smallest <= 0, f"{field} tensor {name}", "above 0", smallest, remedy=remedy)  # NaN: require_finite
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     return network
 

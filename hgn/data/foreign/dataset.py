@@ -89,11 +89,11 @@ def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float
 
     Raises: ConfigError if particles in free flight contradict it, unless it is `known` from the settings.
     """
-    stored = [gravity for trajectory in first if (gravity := info.gravity or trajectory.gravity)]
+    stored = [gravity for trajectory in first if (gravity := trajectory.gravity or info.gravity)]
     if len(stored) < len(first):
         return _estimated([trajectory for trajectory in first if trajectory.gravity is None], info)
     for trajectory, gravity in zip(first, stored, strict=True):
-        stored_3 = np.array(trajectory.gravity or gravity)
+        stored_3 = np.array(gravity)
         if known or not stored_3.any():
             continue
         try:
@@ -105,7 +105,7 @@ def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float
                 f"{trajectory.name}: gravity must agree with free flight, in length per second squared, got "
                 f"{stored_3.tolist()} instead of {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
             )
-    return stored[0]
+    return info.gravity or stored[0]
 
 
 def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
