@@ -26,14 +26,15 @@ def main(mapping: dict[str, Any]) -> int:
         mapping["materials"] = {str(key): value for key, value in mapping["materials"].items()}
     config = from_mapping(ImportConfig, mapping)
     with bar("importing", total=None, unit="episode") as progress:
-        manifest, note = import_set(Path(str(source)), config, lambda _: progress.update())
+        manifest, neighbours, note = import_set(Path(str(source)), config, lambda _: progress.update())
     if note is not None:
         print(printable(note), file=sys.stderr)
     own = manifest.config["imported"]
     counts = ", ".join(f"{count} {split}" for split, count in manifest.requested.items())
     gravity = ", ".join(f"{value:.4g}" for value in own["gravity"])
     print(f"{own['format']}, {own['dimensions']}D, {', '.join(own['materials'])}; {counts} episodes in {config.out}")
-    print(f"gravity ({gravity}), obstacles: {'yes' if own['obstacles'] else 'none'}, radius {own['radius']:g}")
+    radius = f"radius {own['radius']:g} with {neighbours:.2g} neighbours on average"
+    print(f"gravity ({gravity}), obstacles: {'yes' if own['obstacles'] else 'none'}, {radius}")
     print(f"to train: python -m hgn.train +experiment=imported dataset.folder={config.out}")
     return 0
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from typing import Any
 
 import h5py
@@ -227,10 +228,38 @@ def test_what_published_files_have(tmp_path):
     assert np.array_equal(first, 2.0 * np.arange(10)) and np.array_equal(second, first + 1)
 
 
+def test_a_radius_without_neighbours_is_refused(tmp_path, capsys):
+    """By the radius that contains about 15; the mean is printed."""
+    side = 0.3 + 0.04 * np.arange(5)
+    lattice = np.stack(np.meshgrid(side, side, side), -1).reshape(-1, 3)
+    walk = np.repeat(lattice[None], 9, axis=0) + 0.0001 * np.random.default_rng(0).normal(size=(9, 125, 3))
+    wall = np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 0.2]])
+    source = write(tmp_path / "near", "plain", {"train": [(walk, np.full(125, 5), wall)]}, metadata())
+    message = (
+        r"radius must contain at least 1 neighbour on average, got 0 within 0.002; radius=(0.0\d+) contains about 15"
+    )
+    with pytest.raises(ConfigError, match=message) as refused:
+        import_trajectories.main(options(tmp_path / "mine", source, radius=0.002))
+    found = re.search(message, str(refused.value))
+    assert found is not None and 0.056 < float(found[1]) < 0.08  # the edges of the lattice have fewer than the inside
+    import_trajectories.main(options(tmp_path / "mine", source, radius=float(found[1])))
+    (mean,) = re.findall(r"obstacles: yes, radius 0.0\d+ with (\d+) neighbours on average", capsys.readouterr().out)
+    assert 10 <= int(mean) <= 20
+
+
+def test_positions_in_another_unit_than_bounds_are_refused_for_bounds(tmp_path):
+    """Positions rounded to mm are neither refused for their resolution nor for their distances or gravity."""
+    walk = np.random.default_rng(0).uniform(300, 460, (9, 125, 3)).round().astype(np.float32)
+    simulations = {"train": [(walk, np.full(125, 5), NOTHING)]}
+    source = write(tmp_path / "foreign", "plain", simulations, metadata(gravity=list(GRAVITY)))
+    with pytest.raises(ConfigError, match=r"bounds must contain the particles, .* 100% of .* in \[\[30\d.0, "):
+        import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
+
+
 def flat_simulations(count=24):
     """Falling particles of a box from 0.1 to 0.9, with a floor of particles."""
     time_T11 = 0.0025 * np.arange(30)[:, None, None]
-    start = np.random.default_rng(2).uniform(0.4, 0.6, (count, 2))
+    start = np.random.default_rng(2).uniform(0.46, 0.54, (count, 2))
     path = start + np.array([0.3, 0.0]) * time_T11 - 0.5 * np.array([0.0, 9.8]) * time_T11**2
     floor = np.stack([np.arange(0.1, 0.9, 0.005), np.full(160, 0.12)], -1)
     types = np.where(np.arange(count) % 2, 5, 7)

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from hgn.data.entries import SPLITS, EpisodeEntry, ShardEntry
 from hgn.data.foreign.episodes import Converter, obstacle_cell_size
 from hgn.data.foreign.formats import find_format, read_split, set_info
 from hgn.data.foreign.gravity import estimate_gravity
 from hgn.data.foreign.settings import ImportConfig
-from hgn.data.foreign.trajectory import SetInfo, Trajectory
+from hgn.data.foreign.trajectory import SetInfo, Trajectory, require_inside
 from hgn.data.identity import identity_hash
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
@@ -25,16 +26,17 @@ from hgn.schema import ConfigError, require
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 SHARD_BYTES = 128 << 20  # a shard ends with the episode that reaches this size
-LOOKED_AT = 4  # number of trajectories that give estimates of gravity and of the boundary particles' spacing
+LOOKED_AT = 4  # number of trajectories that give estimates of gravity, neighbours and the boundary particles' spacing
+USUAL_NEIGHBOURS = 15  # published sets have about 10 to 20
 
 
 def import_set(
     source: Path, config: ImportConfig, progress: Callable[[Episode], Any] = lambda _: None
-) -> tuple[Manifest, str | None]:
+) -> tuple[Manifest, float, str | None]:
     """Reads the trajectories of a folder and writes them as a data set. Calls `progress` for each episode.
 
-    Returns the manifest, and a warning about trajectories that leave their bounds, or None. The manifest is written
-    last, so an interrupted import can be started again.
+    Returns the manifest, the mean number of neighbours, and a warning about trajectories that leave their bounds, or
+    None. The manifest is written last, so an interrupted import can be started again.
     Raises: ConfigError naming the file and field that cannot be read; OSError.
     """
     out = Path(config.out)
@@ -42,7 +44,10 @@ def import_set(
     info = set_info(source, find_format(source, config.format), config)
     first = list(itertools.islice(read_split(source, "train", info), LOOKED_AT))
     require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
+    for trajectory in first:
+        require_inside(trajectory, info)
     gravity = _gravity(first, info, known=config.gravity is not None)
+    neighbours = _neighbour_count(first, info)
     still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
     converter = Converter(info, gravity, config.history, obstacle_cell_size(info, still))
     del first, still
@@ -81,7 +86,7 @@ def import_set(
     }
     requested = {split: sum(len(shard.episodes) for shard in shards if shard.split == split) for split in SPLITS}
     manifest = Manifest(identity_hash(identity), identity, requested, len(shards)).save(out, shards)
-    return manifest, converter.note_on_bounds(sum(requested.values()))
+    return manifest, neighbours, converter.note_on_bounds(sum(requested.values()))
 
 
 def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float, ...]:
@@ -118,6 +123,29 @@ def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
             f"{info.gravity_size:g}, got {size:.3g}; for example gravity=[0,-{info.gravity_size:g}]"
         )
     return gravity
+
+
+def _neighbour_count(first: list[Trajectory], info: SetInfo) -> float:
+    """Returns the mean number of neighbours of moving particles in the first and last frames.
+
+    Raises: ConfigError for a mean below 1, except if all trajectories have few particles.
+    """
+    counts: list[np.ndarray] = []
+    usual: list[np.ndarray] = []  # radii with the usual number of neighbours
+    for trajectory in first:
+        free_N = ~np.isin(trajectory.type_N, list(info.boundary_types))
+        for position_ND in trajectory.position_TND[[0, -1]][:, free_N]:
+            tree, some_nD = KDTree(position_ND), position_ND[:: 1 + len(position_ND) // 1000]
+            counts.append(tree.query_ball_point(some_nD, info.radius, return_length=True) - 1)
+            if len(position_ND) > USUAL_NEIGHBOURS:
+                usual.append(tree.query(some_nD, k=[USUAL_NEIGHBOURS + 1])[0])
+    mean = sum(int(count_n.sum()) for count_n in counts) / max(1, sum(map(len, counts)))
+    if usual and mean < 1:
+        raise ConfigError(
+            f"radius must contain at least 1 neighbour on average, got {mean:.2g} within {info.radius:g}; "
+            f"radius={np.median(np.concatenate(usual)):.2g} contains about {USUAL_NEIGHBOURS}"
+        )
+    return mean
 
 
 def _boundary(trajectory: Trajectory, info: SetInfo) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hgn.config import NetworkConfig
 from hgn.data.foreign.boundary import boundary_grid, spacing
-from hgn.data.foreign.trajectory import SetInfo, Trajectory, require_fine
+from hgn.data.foreign.trajectory import SetInfo, Trajectory, require_fine, require_inside
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -20,7 +20,6 @@ from hgn.schema import ConfigError, Vector, require
 
 CELL_OF_RADIUS = 1 / 64 / NetworkConfig.cell_size  # ratio of the paper's obstacle cells to its networks' cells
 AT_REST = 1e-3  # largest motion of a boundary's particles, in radii
-OUTSIDE = 0.01  # largest fraction of particles that may start more than a radius outside the box
 
 
 @dataclass(eq=False)
@@ -62,6 +61,7 @@ class Converter:
         require(frames >= first + 2, f"{name}: position", f"of at least {first} + 2 frames for history={first}", frames)
         fixed_N = np.isin(trajectory.type_N, list(info.boundary_types))
         require(not fixed_N.all(), f"{name}: position", "of particles that are not obstacles", "none", "leave it out")
+        require_inside(trajectory, info)
         require_fine(name, trajectory.position_TND, info.radius)
         position_TN3 = self._placed(trajectory.position_TND)
         still_TP3, free_TN3 = position_TN3[:, fixed_N], position_TN3[:, ~fixed_N]
@@ -71,7 +71,6 @@ class Converter:
                 f"{name}: particles of types {sorted(info.boundary_types)} must be at rest, got a displacement of "
                 f"{moved:.3g}: imported obstacles cannot move; set the types of obstacles with boundary_types=[...]"
             )
-        self._require_inside(name, free_TN3[0])
         self._require_not_across(name, free_TN3)
         self._note_outside(name, trajectory.position_TND[:, ~fixed_N])
         boundary_P3 = still_TP3[0]
@@ -128,19 +127,6 @@ class Converter:
         placed[..., 2] = self.plane
         placed[..., : self.info.dimensions] = position_xD - offset_D if offset_D.any() else position_xD
         return placed
-
-    def _require_inside(self, name: str, position_N3: np.ndarray) -> None:
-        reach = self.info.radius
-        beyond_N3 = (position_N3 < -reach) | (position_N3 > np.array(self.domain_size) + reach)
-        outside = beyond_N3.any(-1).mean() if len(position_N3) else 0.0
-        if outside > OUTSIDE:
-            place_N3 = position_N3.astype(np.float64) + self.offset
-            corners = (place_N3.min(0), place_N3.max(0))
-            extent = [[round(float(c[axis]), 4) for c in corners] for axis in range(self.info.dimensions)]
-            raise ConfigError(
-                f"bounds must contain the particles, got {[list(pair) for pair in self.info.bounds]} with "
-                f"{outside:.0%} of {name} outside, whose particles are in {extent}; give bounds=…"
-            )
 
     def _note_outside(self, name: str, position_TND: np.ndarray) -> None:
         """Records a trajectory that leaves its bounds. A set is not refused for one splash over an edge."""

@@ -18,6 +18,7 @@ SAMPLED = 100_000  # number of coordinates of a trajectory that are searched for
 MOVES = 20  # number of changed coordinates above which repeated values show rounding
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
 MOST_CELLS = 1 << 16  # largest number of obstacle cells along an axis
+OUTSIDE = 0.01  # largest fraction of particles that may start more than a radius outside the box
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
 
@@ -147,6 +148,19 @@ def _step(position_TND: np.ndarray, radius: float) -> float:
     # a particle whose motion in a frame is less than the spacing rests, jumps, and rests
     jumps = len(moved) > MOVES and 2 * len(values) < len(moved) and 2 * moves_Tn.sum() < moves_Tn.size
     return float(np.diff(values).min()) if len(values) > 1 and (jumps or not few) else 0.0
+
+
+def require_inside(trajectory: Trajectory, info: SetInfo) -> None:
+    """Refuses bounds that do not contain the moving particles of the first frame."""
+    place_ND = trajectory.position_TND[0, ~np.isin(trajectory.type_N, list(info.boundary_types))].astype(np.float64)
+    low_D, high_D = np.array(info.bounds).T
+    outside_N = ((place_ND < low_D - info.radius) | (place_ND > high_D + info.radius)).any(-1)
+    if outside_N.sum() > OUTSIDE * len(place_ND):
+        extent = np.stack([place_ND.min(0), place_ND.max(0)], -1).round(4).tolist()
+        raise ConfigError(
+            f"bounds must contain the particles, got {[list(pair) for pair in info.bounds]} with "
+            f"{outside_N.mean():.0%} of {trajectory.name} outside, whose particles are in {extent}; give bounds=…"
+        )
 
 
 def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
