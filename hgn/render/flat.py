@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
+from hgn.render.fragments import fragments
 from hgn.render.renderer import (
     BACKGROUND_COLOR,
     BOX_COLOR,
@@ -18,7 +19,6 @@ from hgn.render.renderer import (
     WALL_COLOR,
     Camera,
     Stage,
-    fragments,
     to_bytes,
 )
 from hgn.scene.scene import Obstacle, all_corners
@@ -53,8 +53,8 @@ class FlatStage(Stage):
         corner_F33 = all_corners(obstacles)
         if len(corner_F33):
             xy, _ = camera.project(corner_F33.reshape(-1, 3))
-            _, covered_S, _ = fragments(xy.reshape(-1, 3, 2), camera.width, camera.height)
-            picture_P3[covered_S] = OBSTACLE_COLOR
+            for _, covered_S, _ in fragments(xy.reshape(-1, 3, 2), camera.width, camera.height):
+                picture_P3[covered_S] = OBSTACLE_COLOR
         self.empty_P3 = to_bytes(picture_P3)
 
     def _prepare_room(self, domain_size: Vector) -> None:

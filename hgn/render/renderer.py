@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from PIL import Image, ImageDraw
 
+from hgn.render.fragments import FRAGMENTS_AT_ONCE, fragments
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors
 from hgn.schema import Vector
@@ -41,7 +42,6 @@ AZIMUTH_DEG, ELEVATION_DEG = 28.0, 20.0
 CAMERA_DISTANCE = 3.4  # in domain diagonals; a large distance gives a weak perspective
 LIGHT = np.array((-0.30, 1.0, 0.28)) / np.linalg.norm((-0.30, 1.0, 0.28))  # points towards the light
 SHADOW_CELLS = 160  # number of cells of the floor's shadow map along the longer side
-FRAGMENTS_AT_ONCE = 2_000_000
 
 
 class Camera:
@@ -154,28 +154,38 @@ class Stage:
         unit_F3, normal_F33 = smooth_normals(corner_F33)
 
         xy, depth = camera.project(corner_F33.reshape(-1, 3))
-        triangle_S, pixel_S, weight_S3 = fragments(xy.reshape(-1, 3, 2), camera.width, camera.height)
-        # 1 / depth is linear on the screen.
-        inverse_S3 = weight_S3 / depth.reshape(-1, 3)[triangle_S]
-        inverse_S = inverse_S3.sum(axis=1)
-        depth_S = (1 / inverse_S).astype(np.float32)
-        normal_S3 = np.einsum("sk,skd->sd", inverse_S3 / inverse_S[:, None], normal_F33[triangle_S])
-        shade_S = self._obstacle_shade(normal_S3)
-        order = np.lexsort((depth_S, pixel_S))
-        pixel_S, depth_S, shade_S = pixel_S[order], depth_S[order], shade_S[order]
-        rank_S = np.arange(len(pixel_S)) - np.searchsorted(pixel_S, pixel_S)
-        shown = rank_S < LAYERS
-        self.layer_depth_LP[rank_S[shown], pixel_S[shown]] = depth_S[shown]
-        self.layer_shade_LP[rank_S[shown], pixel_S[shown]] = shade_S[shown]
         triangle_P = np.full(pixel_count, -1)
-        triangle_P[pixel_S[rank_S == 0]] = triangle_S[order][rank_S == 0]
+        for triangle_S, pixel_S, weight_S3 in fragments(xy.reshape(-1, 3, 2), camera.width, camera.height):
+            # 1 / depth is linear on the screen.
+            inverse_S3 = weight_S3 / depth.reshape(-1, 3)[triangle_S]
+            inverse_S = inverse_S3.sum(axis=1)
+            depth_S = (1 / inverse_S).astype(np.float32)
+            order = np.flatnonzero(depth_S < self.layer_depth_LP[-1, pixel_S])
+            order = order[np.lexsort((depth_S[order], pixel_S[order]))]
+            pixel_S, depth_S, triangle_S = pixel_S[order], depth_S[order], triangle_S[order]
+            weight_S3 = inverse_S3[order] / inverse_S[order, None]
+            shade_S = self._obstacle_shade(np.einsum("sk,skd->sd", weight_S3, normal_F33[triangle_S]))
+            rank_S = np.arange(len(pixel_S)) - np.searchsorted(pixel_S, pixel_S)
+            at = pixel_S[rank_S == 0]
+            triangle_P[at] = np.where(
+                depth_S[rank_S == 0] < self.layer_depth_LP[0, at], triangle_S[rank_S == 0], triangle_P[at]
+            )
+            # the nearest of the layers so far and of these
+            depth_AK = np.concatenate([self.layer_depth_LP[:, at].T, np.full((len(at), LAYERS), np.inf, np.float32)], 1)
+            shade_AK = np.concatenate([self.layer_shade_LP[:, at].T, np.zeros((len(at), LAYERS), np.float32)], 1)
+            shown = rank_S < LAYERS
+            place = np.cumsum(rank_S == 0)[shown] - 1, LAYERS + rank_S[shown]
+            depth_AK[place], shade_AK[place] = depth_S[shown], shade_S[shown]
+            nearest_AL = np.argsort(depth_AK, axis=1, kind="stable")[:, :LAYERS]
+            self.layer_depth_LP[:, at] = np.take_along_axis(depth_AK, nearest_AL, axis=1).T
+            self.layer_shade_LP[:, at] = np.take_along_axis(shade_AK, nearest_AL, axis=1).T
         self._darken_outlines(triangle_P, unit_F3)
 
         rows, columns = self.map_shape
         xy = self._to_map(corner_F33.reshape(-1, 3)).reshape(-1, 3, 2)
-        triangle_S, cell_S, weight_S3 = fragments(xy, columns, rows)
-        height_S = np.einsum("sk,sk->s", weight_S3, corner_F33[triangle_S, :, 1])
-        np.maximum.at(self.map_top, cell_S, height_S)
+        for triangle_S, cell_S, weight_S3 in fragments(xy, columns, rows):
+            height_S = np.einsum("sk,sk->s", weight_S3, corner_F33[triangle_S, :, 1])
+            np.maximum.at(self.map_top, cell_S, height_S)
         self.map_obstacle = _blurred(np.isfinite(self.map_top).astype(np.float32).reshape(self.map_shape), 1.6)
 
     def _obstacle_shade(self, normal_S3: np.ndarray) -> np.ndarray:
@@ -393,44 +403,6 @@ def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         close = (unit_F3[mine // 3] * unit_F3[other // 3]).sum(axis=1) >= math.cos(math.radians(CREASE_DEG))
         smooth[mine[close]] += area_F3[other[close] // 3]
     return unit_F3, smooth.reshape(-1, 3, 3)
-
-
-def fragments(corner_F32: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the pixels whose centres lie in triangles with the pixel coordinates [F, 3, 2].
-
-    The results are triangle index [S], pixel index (row by row) [S], and barycentric weights [S, 3].
-    """
-    low = np.clip(np.floor(corner_F32.min(axis=1)), 0, (width, height)).astype(np.int64)
-    high = np.clip(np.ceil(corner_F32.max(axis=1)), 0, (width, height)).astype(np.int64)
-    a, b, c = (corner_F32[:, k] for k in range(3))
-    area_F = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    span = high - low
-    count_F = np.where(np.abs(area_F) > 1e-9, span[:, 0] * span[:, 1], 0)
-    batches = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))]
-    batch_F = np.cumsum(count_F) // FRAGMENTS_AT_ONCE
-    for batch in np.unique(batch_F[count_F > 0]):
-        chosen = np.flatnonzero((batch_F == batch) & (count_F > 0))
-        triangle_S = np.repeat(chosen, count_F[chosen])
-        within_S = np.arange(len(triangle_S)) - np.repeat(np.cumsum(count_F[chosen]) - count_F[chosen], count_F[chosen])
-        x_S = low[triangle_S, 0] + within_S % span[triangle_S, 0]
-        y_S = low[triangle_S, 1] + within_S // span[triangle_S, 0]
-        center = np.stack((x_S, y_S), axis=1) + 0.5
-        weight_S3 = np.stack(
-            [_edge(center, corner_F32[triangle_S, (k + 1) % 3], corner_F32[triangle_S, (k + 2) % 3]) for k in range(3)],
-            axis=1,
-        )
-        weight_S3 /= area_F[triangle_S, None]
-        inside = (weight_S3 >= 0).all(axis=1)
-        batches.append((triangle_S[inside], (y_S * width + x_S)[inside], weight_S3[inside]))
-    triangle, pixel, weight = (np.concatenate(part) for part in zip(*batches, strict=True))
-    return triangle, pixel, weight
-
-
-def _edge(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Returns twice the signed area of (start, end, point)."""
-    return (end[:, 0] - start[:, 0]) * (point[:, 1] - start[:, 1]) - (end[:, 1] - start[:, 1]) * (
-        point[:, 0] - start[:, 0]
-    )
 
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:

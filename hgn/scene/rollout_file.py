@@ -50,6 +50,7 @@ LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FARTHEST = 1000  # largest coordinate of particles in a file, in domain sizes; a simulation diverges before
 # kinds of the numbers in datasets, as NumPy calls them
 KINDS = {"VTKHDF/Points": "f", "VTKHDF/NumberOfPoints": "iu", "hgn/reference": "f", "hgn/entry_frame": "iu"}
+TRIANGLE_BYTES = 1000  # about the memory that a picture takes for a triangle
 FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
 
 
@@ -399,7 +400,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     rollout = Rollout(
         position_TN3=position_TP3[:, vertices:],
         material_N=material_N,
-        obstacles=tuple(_read_obstacle(entry) for _, entry in sorted(own["obstacles"].items())),
+        obstacles=tuple(_read_obstacle(entry, claims) for _, entry in sorted(own["obstacles"].items())),
         domain_size=triple(own.attrs["domain_size"].tolist()),
         frame_rate_hz=float(own.attrs["frame_rate_hz"].item()),
         gravity=triple(own.attrs["gravity"].tolist()),
@@ -416,17 +417,18 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     return rollout
 
 
-def _read_obstacle(entry: h5py.Group) -> Obstacle:
+def _read_obstacle(entry: h5py.Group, claims: Claims) -> Obstacle:
     vertex_V3, triangle_F3 = entry["vertices"][()], entry["triangles"][()]
     for name, array, kinds in (("vertices", vertex_V3, "f"), ("triangles", triangle_F3, "iu")):
         if array.dtype.kind not in kinds or array.ndim != 2 or array.shape[1] != 3:
             raise ConfigError(f"{entry.name}: {name} must be numbers [any, 3], got {array.dtype} {array.shape}")
     rule, size = "finite and at most 1e15", float(np.abs(vertex_V3).max(initial=0))
     require(size <= LARGEST, f"{entry.name}: vertices", rule, size)
-    low, high = triangle_F3.min(initial=0), triangle_F3.max(initial=-1)
-    if low < 0 or high >= len(vertex_V3):
+    low, high = triangle_F3.min(initial=0), triangle_F3.max(initial=0)
+    if low < 0 or (len(triangle_F3) and high >= len(vertex_V3)):
         raise ConfigError(f"{entry.name}: triangles must be of {len(vertex_V3)} vertices, got vertices {low} to {high}")
-    motion = _read_motion(entry) if "time" in entry else None
+    claims.add(f"{entry.name}: triangles", len(triangle_F3), TRIANGLE_BYTES)
+    motion, triangle_F3 = _read_motion(entry) if "time" in entry else None, triangle_F3.astype(np.int32, copy=False)
     return Obstacle(str(entry.attrs["name"]), vertex_V3, triangle_F3, bool(entry.attrs["closed"]), motion=motion)
 
 

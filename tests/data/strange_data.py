@@ -117,11 +117,14 @@ def loop(file):
     file["hgn/self"] = file["hgn"]
 
 
+def replaced(name, value):
+    return lambda file: (file.pop(name), file.create_dataset(name, data=value, compression="gzip"))
+
+
 def linked_obstacles(file):
     group = file["hgn/obstacles"]
     one = group["0000"]
-    del one["vertices"]
-    one.create_dataset("vertices", data=np.zeros((60_000, 3)), compression="gzip")
+    replaced("vertices", np.zeros((60_000, 3)))(one)
     for number in range(2000):
         group[f"n{number}"] = one
 
@@ -133,8 +136,7 @@ def frames_of_nobody(file):
         "VTKHDF/PointData/material": np.zeros(100_000, np.uint8),
         "VTKHDF/Vertices/Connectivity": np.zeros(100_000, np.int64),
     }.items():
-        del file[name]
-        file.create_dataset(name, data=value, compression="gzip")
+        replaced(name, value)(file)
     file.create_dataset("hgn/entry_frame", data=np.full(100_000, 10**6), compression="gzip")
 
 
@@ -161,6 +163,7 @@ cases(
         "loop": rollout(loop),
         "linked obstacles": rollout(linked_obstacles),
         "frames of nobody": rollout(frames_of_nobody),
+        "triangles": rollout(replaced("hgn/obstacles/0000/triangles", np.tile(np.int32([0, 1, 2]), (5_000_000, 1)))),
     },
     read_rollout,
 )

@@ -10,10 +10,11 @@ import trimesh
 from safetensors.torch import save
 
 from hgn.config import NetworkConfig
-from hgn.render.renderer import smooth_normals
+from hgn.render.renderer import Stage, smooth_normals
 from hgn.runtime.weights import WeightsInfo, load_weights
 from hgn.scene.mesh import load_mesh
 from hgn.scene.obstacle_grid import build_obstacle_grid
+from hgn.scene.scene import Obstacle
 from hgn.scene.scene_file import load_scene, notes_on_files
 from hgn.schema import to_mapping
 from hgn.system.yaml_files import read_yaml
@@ -328,7 +329,18 @@ def fan(_):
     return np.stack([0 * ring[1:], ring[:-1], ring[1:]], axis=1)
 
 
+def large_triangles(count):
+    """Triangles on one another that fill a picture."""
+    obstacle = Obstacle("large", 4 * np.eye(3) - 1, np.tile(np.int32([[0, 1, 2]]), (count, 1)), closed=False)
+    return lambda _: [obstacle]
+
+
 cases("picture", {"fan": fan}, smooth_normals)
+cases(
+    "picture",
+    {f"{count} large triangles": large_triangles(count) for count in (50, 100_000)},
+    lambda obstacles: Stage((1.0, 1.0, 1.0), obstacles, 0.01, 360),
+)
 
 # scene files
 

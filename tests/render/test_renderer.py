@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from hgn.render.renderer import LIGHT, MATERIAL_COLORS, Camera, Stage, fragments, smooth_normals
+from hgn.render import fragments as fragments_module
+from hgn.render.fragments import fragments
+from hgn.render.renderer import LIGHT, MATERIAL_COLORS, Camera, Stage, smooth_normals
 from hgn.scene.scene import Obstacle
 
 UNIT = (1.0, 1.0, 1.0)
@@ -30,7 +32,7 @@ def test_fragments():
     """The pixels under a right triangle are those whose centres it contains, and its weights give them back. A triangle
     beyond the picture fills it whole, with either winding; a degenerate one gives nothing."""
     corner = np.array([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]])
-    triangle, pixel, weight = fragments(corner, 5, 6)
+    ((triangle, pixel, weight),) = fragments(corner, 5, 6)
     place = np.stack((pixel % 5, pixel // 5), axis=1)
     assert set(triangle) == {0}
     assert sorted(map(tuple, place.tolist())) == [(x, y) for x in range(4) for y in range(4) if x + y + 1 <= 4]
@@ -39,8 +41,20 @@ def test_fragments():
     large = np.array([[-50.0, -50.0], [200.0, -50.0], [-50.0, 200.0]])
     flat = np.array([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]])
     for corners in (large, large[::-1]):
-        triangle, pixel, _ = fragments(np.stack((corners, flat)), 7, 3)
+        ((triangle, pixel, _),) = fragments(np.stack((corners, flat)), 7, 3)
         assert set(triangle) == {0} and sorted(pixel) == list(range(21))
+
+
+def test_parts_of_the_obstacles(monkeypatch):
+    """Obstacles look the same in whatever parts their pixels are drawn."""
+    corner_C3 = np.random.default_rng(0).random((90, 3))
+    obstacle = Obstacle("random", corner_C3, np.arange(90, dtype=np.int32).reshape(30, 3), closed=False)
+    whole = Stage(UNIT, [obstacle], 0.01, 64)
+    monkeypatch.setattr(fragments_module, "FRAGMENTS_AT_ONCE", 700)
+    parts = Stage(UNIT, [obstacle], 0.01, 64)
+    assert np.isfinite(whole.layer_depth_LP[-1]).any()
+    for name in ("layer_depth_LP", "layer_shade_LP", "map_top", "empty_P3"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 
 
 def test_smooth_normals():

@@ -302,6 +302,14 @@ def test_other_files_are_refused(tmp_path, change, message):
             read_rollout(tmp_path / f"{name}.vtkhdf")
 
 
+@pytest.mark.parametrize("dtype", ["u1", "i8", "u8"])
+def test_triangles_of_other_types(tmp_path, dtype):
+    """Triangles are read as int32 from whole numbers of any size."""
+    rollout = stored(tmp_path, make_rollout(), array(f"{SHEET}/triangles", np.array([[0, 1, 2]], dtype)))
+    assert_same(rollout.obstacles, make_rollout().obstacles)
+    assert rollout.obstacles[0].triangle_F3.dtype == np.int32
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
