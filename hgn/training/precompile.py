@@ -14,24 +14,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import torch
 
-from hgn.config import NetworkConfig, SceneConfig, TrainConfig
+from hgn.config import TrainConfig
 from hgn.kernels.grid.op import Window
 from hgn.kernels.moving import MovingTable
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.triton_compat import Launches, compile_launches, noted_launches, use_target
-from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.kernels.update.op import Updates
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_stepper import TritonStepper
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.schema import from_mapping, to_mapping
-from hgn.step_config import UNCONSTRAINED, StepConfig
+from hgn.step_config import StepConfig
 from hgn.system.machine import available_cpus
 from hgn.system.processes import Program, last_message
 
@@ -40,42 +39,33 @@ COMMAND = (sys.executable, "-m", "hgn.training.precompile")
 NICENESS = 10  # low priority of the compiling processes
 
 
-@dataclass(frozen=True)
-class PrecompileJob:
-    """A training whose kernels are compiled ahead."""
+def launches_of(
+    config: TrainConfig, several_ranks: bool, sizes: tuple[int, tuple[int, ...]], device: str = "meta"
+) -> Launches:
+    """Returns every kernel of a training with its specialisation, by a key of both. Needs a GPU, or `use_target`.
 
-    network: NetworkConfig
-    settings: UpdateSettings
-    precision: str
-    several_ranks: bool
-    averages: bool  # whether the training averages its parameters
-    particles: int  # approximate number of particles in an update
-    cells: tuple[int, ...]  # approximate number of cells on each level
-    capability: int  # capability of the GPU: 90 for an H100
-    pushforward_scenes: int = 0  # number of scenes that pushforward simulates together; 0: none
-    step: StepConfig = UNCONSTRAINED  # constraints of these simulations
-
-
-def launches_of(job: PrecompileJob, device: str = "meta") -> Launches:
-    """Returns every kernel of a job with its specialisation, by a key of both. Needs a GPU, or `use_target`."""
+    `sizes` are approximate numbers of particles, and of cells on each level, in an update.
+    """
+    training, own, (particles, cells) = config.training, config.network.own_physics, sizes
     with noted_launches() as launches:
         with torch.device(device):
-            network = HierarchicalGraphNetwork(job.network)
-        nothing = torch.zeros(5, device=device)
-        reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
-        updates = Updates(network, job.settings, job.precision, nothing[:2], counters=nothing, reduce=reduce)
-        updates.average = torch.zeros_like(updates.values) if job.averages else None
-        updates.allocate(job.particles, job.cells)
+            network = HierarchicalGraphNetwork(config.network)
+        sums, counters = torch.zeros(2, device=device), torch.zeros(5, device=device)
+        reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if several_ranks else None
+        cell_size, precision = config.scene.cell_size, training.precision
+        updates = Updates(network, training, cell_size, precision, loss_sum=sums, counters=counters, reduce=reduce)
+        updates.average = torch.zeros_like(updates.values) if training.ema_decay > 0 else None
+        updates.allocate(particles, cells)
         updates.launches()
-        if "moving" in job.network.own_physics:
+        if "moving" in own:
             updates.allocate_moving(1)
             updates.launches()
-        if job.pushforward_scenes > 0:
-            ratio = job.pushforward_scenes / job.settings.scenes
-            particles, *cells = (round(ratio * count) for count in (job.particles, *job.cells))
-            simulation_launches(
-                network, job.step, job.precision, tuple(cells), scenes=job.pushforward_scenes, particles=particles
-            )
+        if training.pushforward_fraction > 0:
+            scenes = training.pushforward_scenes
+            ratio = scenes / training.batch_scenes
+            particles, *rest = (round(ratio * count) for count in (particles, *cells))
+            step = config.step.in_training
+            simulation_launches(network, step, precision, tuple(rest), scenes=scenes, particles=particles)
     return launches
 
 
@@ -121,48 +111,40 @@ def simulation_launches(
     return stepper
 
 
-def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
-    """Returns the kernels that a training on such a GPU needs. The distribution of scenes determines their sizes."""
-    training, network = config.training, config.network
-    particles, cells = _sizes(config.scene, network.levels)
-    return PrecompileJob(
-        network,
-        UpdateSettings.of(training, config.scene.cell_size),
-        training.precision,
-        several_ranks,
-        averages=training.ema_decay > 0,
-        particles=training.batch_scenes * particles,
-        cells=tuple(training.batch_scenes * count for count in cells),
-        capability=10 * capability[0] + capability[1],
-        pushforward_scenes=training.pushforward_scenes if training.pushforward_fraction > 0 else 0,
-        step=config.step.in_training,
-    )
-
-
-def _sizes(scene: SceneConfig, levels: int) -> tuple[int, list[int]]:
-    """Returns the numbers of initial particles and of cells on each level, for a scene whose groups are cubes."""
+def sizes_of(config: TrainConfig) -> tuple[int, tuple[int, ...]]:
+    """Returns the initial numbers of particles, and of cells on each level, in an update, if groups are cubes."""
+    scene, scenes = config.scene, config.training.batch_scenes
     edge = scene.group_size / scene.cell_size
     particles = scene.group_count * scene.particles_per_cell * edge**3
     cells, length = [], edge + 2  # neighbours of a particle's cell are active too
-    for _ in range(levels):
-        cells.append(max(1, round(scene.group_count * length**3)))
+    for _ in range(config.network.levels):
+        cells.append(scenes * max(1, round(scene.group_count * length**3)))
         length = (length + 1) / 2
-    return max(1, round(particles)), cells
+    return scenes * max(1, round(particles)), tuple(cells)
 
 
 class Precompilation:
     """Processes that compile kernels."""
 
-    def __init__(self, job: PrecompileJob, processes: int | None = None, command: Sequence[str] = COMMAND) -> None:
-        """Starts `processes` with low priority, by default two fewer than there are cores."""
+    def __init__(
+        self,
+        config: TrainConfig,
+        capability: tuple[int, int],
+        several_ranks: bool,
+        processes: int | None = None,
+        command: Sequence[str] = COMMAND,
+    ) -> None:
+        """Starts `processes` with low priority, by default two fewer than there are cores.
+
+        `capability` is the GPU's, (9, 0) for an H100. `config` names the precision.
+        """
         processes = processes or max(1, min(MOST_PROCESSES, available_cpus() - 2))
         self._started = time.monotonic()
         self._files = contextlib.ExitStack()
         outputs = [self._files.enter_context(tempfile.TemporaryFile()) for _ in range(processes)]  # noqa: SIM115
-        text = json.dumps(to_mapping(job))
-        self._programs = [
-            Program([*command, str(part), str(processes)], output, text) for part, output in enumerate(outputs)
-        ]
+        text, (major, minor) = json.dumps(to_mapping(config)), capability
+        common = [*map(str, (processes, 10 * major + minor, int(several_ranks)))]
+        self._programs = [Program([*command, str(part), *common], file, text) for part, file in enumerate(outputs)]
 
     def __enter__(self) -> Self:
         return self
@@ -199,17 +181,18 @@ class Precompilation:
         self._files.close()
 
 
-def compile_part(job: PrecompileJob, part: int, parts: int) -> int:
+def compile_part(config: TrainConfig, several_ranks: bool, part: int, parts: int) -> int:
     """Compiles every `parts`-th kernel, starting with number `part`. Returns the number of these kernels."""
-    return len(compile_launches(list(launches_of(job).values())[part::parts]))
+    launches = launches_of(config, several_ranks, sizes_of(config))
+    return len(compile_launches(list(launches.values())[part::parts]))
 
 
 def main() -> None:
-    """Compiles a part of the kernels of the job on standard input."""
+    """Compiles a part of the kernels of the training on standard input."""
     os.nice(NICENESS)
-    job = from_mapping(PrecompileJob, json.load(sys.stdin))
-    use_target(job.capability)
-    print(compile_part(job, *map(int, sys.argv[1:])))
+    part, parts, capability, several_ranks = map(int, sys.argv[1:])
+    use_target(capability)
+    print(compile_part(from_mapping(TrainConfig, json.load(sys.stdin)), bool(several_ranks), part, parts))
 
 
 if __name__ == "__main__":

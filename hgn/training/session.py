@@ -188,12 +188,11 @@ def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitSt
     if backend != "triton" or not on_gpu or not first_on_machine():
         return None
     # imported here, because backend torch does without Triton
-    from hgn.training.precompile import Precompilation, job_of_training
+    from hgn.training.precompile import Precompilation
 
     devices, nodes = layout(training)
     config = replace(config, training=replace(training, precision=precisions[0]))
-    job = job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1)
-    return stack.enter_context(Precompilation(job))
+    return stack.enter_context(Precompilation(config, torch.cuda.get_device_capability(), devices * nodes > 1))
 
 
 def settings_of_run(config: TrainConfig) -> dict[str, Any]:

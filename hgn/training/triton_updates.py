@@ -18,7 +18,7 @@ from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors
 from hgn.kernels.moving import EpisodeMoving
 from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.triton_compat import JitMisses
-from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates
 from hgn.network.base import ParticleNetwork
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import ParityError
@@ -67,9 +67,10 @@ class TritonUpdates:
         self.precision = precision
         self.updates = Updates(
             self.network,
-            UpdateSettings.of(training, self._obstacle_cell_size),
+            training,
+            self._obstacle_cell_size,
             kernel_precision(precision, self.device),
-            trained.loss_sum,
+            loss_sum=trained.loss_sum,
             counters=trained.counters,
             reduce=sum_over_ranks if ranks.count > 1 else None,
             ranks=ranks.count,

@@ -19,11 +19,10 @@ from frame_launches import frame_of
 from no_gpu import use_h100
 from ptx import hazards, overwritten_tiles
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
 from hgn.kernels import triton_compat
-from hgn.kernels.update.op import UpdateSettings
 from hgn.step_config import StepConfig
-from hgn.training.precompile import PrecompileJob, launches_of
+from hgn.training.precompile import launches_of
 
 
 @triton.jit
@@ -52,20 +51,21 @@ def no_ptx(self, source, metadata, *_):
     return ""
 
 
-settings = UpdateSettings(2, 1e-3, True, 1 / 64)
+settings = TrainingConfig(batch_scenes=2, noise_correlated_fraction=0.0)
 relative = NetworkConfig(inputs="local", width=16, levels=3, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
 constrained = StepConfig(0.3, (0.02, 0.04), 1e-3)
 near = replace(relative, obstacle_distance=True, own_physics=("friction", "moving"))
 for seeing, step in ((relative, StepConfig()), (relative, constrained.in_training), (near, constrained)):
     of_relative |= frame_of(seeing, step, "fp16", (9000, 3000, 900), scenes=2, particles=9000)[0]
-of_relative |= launches_of(PrecompileJob(near, settings, "fp16", False, False, 9000, (9000, 3000, 900), 90))
+training = replace(settings, precision="fp16")
+of_relative |= launches_of(TrainConfig(network=near, training=training), False, (9000, (9000, 3000, 900)))
 
 network = NetworkConfig(levels=1, message_passing_steps=1)
 for precision in ("fp16", "tf32"):
     seen = set()
-    job = PrecompileJob(network, settings, precision, False, False, 9000, (9000,), 90)
-    for function, data in launches_of(job).values():
+    job = TrainConfig(network=network, training=replace(settings, precision=precision))
+    for function, data in launches_of(job, False, (9000, (9000,))).values():
         name = function.__name__
         many_warps = json.loads(data)["options"]["num_warps"] > 4
         if name.endswith("weight_gradient") if precision == "fp16" else many_warps and name not in seen:

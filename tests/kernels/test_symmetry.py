@@ -114,9 +114,9 @@ def test_without_symmetry_nothing_changes():
     """
     network = small_network()
     seen, ends = [], []
-    for symmetry, known in ((False, EIGHT), (True, EIGHT[:1])):
+    for symmetry, known in (("none", EIGHT), ("gravity", EIGHT[:1])):
         made = replace(placed(scene_with_obstacles(1, 5), network), symmetries=known)
-        updates = updates_of(network, 1, (256,), noise_std=1e-3, grid_jitter=True, symmetry=symmetry)
+        updates = updates_of(network, 1, (256,), noise_std=1e-3, jitter=True, symmetry=symmetry)
         updates.run([[(made, FRAME, 3)]], [1e-3])
         count = made.position_TN3.shape[1]
         seen.append(
@@ -142,7 +142,7 @@ def test_noise_and_jitter_are_those_without():
     for known in (EIGHT[:1], EIGHT[6:7]):
         noise = []
         for noise_std in (1e-3, 0.0):
-            updates = updates_of(network, 1, (256,), noise_std=noise_std, grid_jitter=True, symmetry=True)
+            updates = updates_of(network, 1, (256,), noise_std=noise_std, jitter=True, symmetry="gravity")
             updates.predict([(replace(made, symmetries=known), FRAME, 3)])
             noise.append((updates.buffers.velocity_NV[:5].cpu().clone(), updates.buffers.origin_S3.cpu().clone()))
         drawn.append((noise[0][0] - noise[1][0], noise[0][1]))

@@ -12,7 +12,7 @@ from training.test_weights import data as data
 
 from hgn import train
 from hgn.config import TrainingConfig
-from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.kernels.update.op import Updates
 from hgn.schema import ConfigError
 from hgn.training import parity, schedule
 from hgn.training.checkpoint import read_checkpoint
@@ -36,9 +36,8 @@ def run_mapping(config, run, **training):
 
 def without_jitter(monkeypatch):
     """Both backends draw the grid's origin from random streams of their own."""
-    settings = UpdateSettings.of
     monkeypatch.setattr("hgn.training.torch_updates.jittered_origin", lambda *_: None)
-    monkeypatch.setattr(UpdateSettings, "of", lambda *arguments: replace(settings(*arguments), grid_jitter=False))
+    monkeypatch.setattr(Updates, "jitter", False)
 
 
 def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):

@@ -9,9 +9,10 @@ import torch
 from kernels.engines import device
 from network.states import network_of, random_grid
 
+from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.scene_tables import SceneHash
-from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates
 from hgn.network.features import ParticleState
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.orthogonal import orthogonalised
@@ -82,16 +83,19 @@ def plain_updates(network, chunk, grids, rates, optimizer=None):
     return losses
 
 
-def updates_of(network, scenes, capacities=(), precision="fp32", **changes):
-    settings = {"noise_std": 0.0, "grid_jitter": False} | changes
-    return Updates(
+def updates_of(network, scenes, capacities=(), precision="fp32", jitter=False, **changes):
+    settings = {"noise_std": 0.0, "noise_correlated_fraction": 0.0} | changes
+    updates = Updates(
         copy.deepcopy(network).float().to(device()),
-        UpdateSettings(scenes=scenes, obstacle_cell_size=CELL_SIZE, **settings),
+        TrainingConfig(batch_scenes=scenes, **settings),
+        CELL_SIZE,
         precision,
         torch.zeros(2, device=device()),
         torch.zeros(5, device=device()),
         capacities=capacities,
     )
+    updates.jitter = jitter
+    return updates
 
 
 def parameters_of(updates):
@@ -161,7 +165,7 @@ def test_noise_and_jitter():
     target undoes the velocity error; origins lie in [-cell, 0]; the same seed draws the same, another seed another."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     made, still = (episode(seed, count, False, spread=0.3)[0] for seed, count in ((1, 160), (2, 120)))
-    updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=True)
+    updates = updates_of(network, 2, noise_std=1e-3, jitter=True)
     names = ("position_N3", "velocity_NV", "target_N3", "origin_S3", "share_N", "scene_N")
     drawn = []
     for seeds in ((5, 6), (5, 6), (7, 6)):
@@ -193,7 +197,7 @@ def test_a_flat_network_is_shown_no_noise_across():
     """With two dimensions z and its velocities are the data's bit by bit, and the grid does not move along it."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, dimensions=2)
     made, _ = episode(1, 64, False, spread=0.3)
-    updates = updates_of(network, 1, noise_std=1e-3, grid_jitter=True, noise_correlated_fraction=0.3)
+    updates = updates_of(network, 1, noise_std=1e-3, jitter=True, noise_correlated_fraction=0.3)
     step_N3 = (assembled(updates, (made, 1, 5)) - clean(made, 1)[1])[:, 0]
     assert not step_N3[:, 2].any() and step_N3[:, :2].all()
     assert torch.equal(updates.buffers.position_N3[:64, 2].cpu(), clean(made, 1)[0][-2, :, 2])
@@ -208,7 +212,7 @@ def test_correlated_noise():
     samples, windows = ((made, 1, 5), (still, 0, 6)), (clean(made, 1), clean(still, 0))
     velocity, walks = torch.cat([velocity for _, velocity in windows]), {}
     for smooth in (0.0, 0.5, 1.0):
-        updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=False, noise_correlated_fraction=smooth)
+        updates = updates_of(network, 2, noise_std=1e-3, jitter=False, noise_correlated_fraction=smooth)
         walks[smooth] = assembled(updates, *samples, room=4096) - velocity
     waves = updates.waves_SKC.cpu()
     length = 2 * math.pi / waves[..., :3].norm(dim=-1) / 0.01
@@ -231,7 +235,7 @@ def test_wrong_kernels_are_refused():
     they agree to rounding, and kernels that compute another network are refused with the remedy."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     samples, episodes = one_with_obstacles()
-    updates = updates_of(network, 2, (64,), noise_std=1e-3, grid_jitter=True)
+    updates = updates_of(network, 2, (64,), noise_std=1e-3, jitter=True)
     updates.predict(samples)
     assert max(require_update_parity(updates, episodes)) < 1e-3
     updates.values.mul_(1.3)
@@ -247,7 +251,7 @@ def test_a_wrong_gradient_of_any_tensor_is_refused(monkeypatch):
     less. With fp16 kernels that are right pass."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     samples, episodes = one_with_obstacles()
-    updates = updates_of(network, 2, (64,), precision="fp16", noise_std=1e-3, grid_jitter=True)
+    updates = updates_of(network, 2, (64,), precision="fp16", noise_std=1e-3, jitter=True)
     updates.predict(samples)
     assert max(require_update_parity(updates, episodes)) < 0.1
     totals, right = updates.fused.totals, updates.fused.totals.clone()

@@ -18,7 +18,7 @@ from hgn.runtime import triton_stepper
 from hgn.scene.material import MATERIALS
 from hgn.scene.symmetry import Symmetry
 from hgn.step_config import StepConfig
-from hgn.training.precompile import job_of_training, launches_of
+from hgn.training.precompile import launches_of
 from hgn.training.triton_pushforward import TritonScenes
 
 OWN = ("friction", "parameters", "elastic", "moving")
@@ -29,17 +29,17 @@ def launches_of_training(config, moves):
     """The launches of an update, and with those of a simulation, on tensors that exist."""
     network = HierarchicalGraphNetwork(config.network)
     network.step = config.step
-    job, training = job_of_training(config, (9, 0), False), config.training
+    training, cell_size = config.training, config.scene.cell_size
     own = EpisodeMoving.of((swept(8, cells=20_000),), 1 / 60, config.network, CPU) if moves else NONE_MOVES
     position_TN3, material_N = torch.rand(20, 40, 3), torch.zeros(40, dtype=torch.int32)
     episode = DeviceEpisode(position_TN3, material_N, None, (1.0, 1.0, 1.0), symmetries=(Symmetry(),), moving=own)
     with noted_launches() as launches:
-        updates = Updates(network, job.settings, job.precision, torch.zeros(2), counters=torch.zeros(5))
+        updates = Updates(network, training, cell_size, "fp16", loss_sum=torch.zeros(2), counters=torch.zeros(5))
         updates.average = torch.zeros_like(updates.values)
         updates._prepare([[DeviceSample(episode, 3, seed) for seed in range(training.batch_scenes)]], [1e-3])
         updates.launches()
         update = dict(launches)
-        scenes = TritonScenes(network, training, config.scene.cell_size, job.precision)
+        scenes = TritonScenes(network, training, cell_size, "fp16")
         scenes.values = updates.values
         state = scenes._state([(episode, 3)])
         scenes._begun([episode], state).frame_launches()
@@ -55,7 +55,7 @@ for own in (OWN[:0], OWN[:1], OWN[:2], OWN[:3], OWN):
     network = replace(network, width=16, levels=2, message_passing_steps=1)
     step = StepConfig(0.3, (0.02, 0.04), 1e-3)
     config = TrainConfig(SceneConfig(own_physics=own), network=network, training=training, step=step)
-    ahead = launches_of(replace(job_of_training(config, (9, 0), False), particles=80, cells=(400, 200)))
+    ahead = launches_of(config, False, (80, (400, 200)))
     for moves in (False, True)[: 1 + ("moving" in own)]:
         update, both = launches_of_training(config, moves)
         missing = [[f.__name__ for key, (f, _) in part.items() if key not in ahead] for part in (update, both)]

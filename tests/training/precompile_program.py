@@ -4,6 +4,9 @@ Prints two paragraphs, the keys in Triton's cache on disk of an update's kernels
 a training, and from behind, as a process might that compiles a share of them.
 """
 
+import contextlib
+import io
+import json
 import os
 import sys
 import threading
@@ -15,13 +18,13 @@ from triton.compiler import ASTSource
 from triton.runtime.cache import triton_key
 from triton.runtime.jit import JITFunction
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.kernels import triton_compat
 from hgn.kernels.triton_compat import noted_launches, preload
-from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime import triton_stepper
+from hgn.schema import to_mapping
 from hgn.step_config import StepConfig
-from hgn.training.precompile import PrecompileJob, compile_part, launches_of
+from hgn.training.precompile import launches_of, main, sizes_of
 
 
 def tell(self, key, signature, device, constants, options, attributes, **_):
@@ -31,12 +34,13 @@ def tell(self, key, signature, device, constants, options, attributes, **_):
 
 
 use_h100()
-settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 network = NetworkConfig(width=16, levels=2, message_passing_steps=2)
-job = PrecompileJob(network, settings, "fp16", True, True, 300, (200, 60), 90)
-found = launches_of(job)
+training = TrainingConfig(batch_scenes=2, precision="fp16", ema_decay=0.9, noise_correlated_fraction=0.0)
+job = TrainConfig(SceneConfig(group_size=0.02), network=network, training=training)
+sizes = sizes_of(job)
+found = launches_of(job, True, sizes)
 expected = set(found)
-assert set(launches_of(job, "cpu")) == expected and len(expected) > 30, len(expected)
+assert set(launches_of(job, True, sizes, "cpu")) == expected and len(expected) > 30, len(expected)
 for order in (list(found.values()), list(found.values())[::-1]):
     child = os.fork()  # what a process has seen of kernels, the next has not
     if child == 0:
@@ -47,7 +51,14 @@ for order in (list(found.values()), list(found.values())[::-1]):
         os._exit(0)
     if os.waitpid(child, 0)[1]:
         sys.exit("asking for keys failed")
-assert compile_part(job, len(expected) - 1, len(expected)) == 1
+# the last of as many processes as there are kernels compiles one
+sys.argv, sys.stdin = (
+    ["", str(len(expected) - 1), str(len(expected)), "90", "1"],
+    io.StringIO(json.dumps(to_mapping(job))),
+)
+with contextlib.redirect_stdout(io.StringIO()) as printed:
+    main()
+assert printed.getvalue() == "1\n"
 
 
 # before a frame is captured all its kernels are compiled, two at a time; a launch would fail, as these have no launcher

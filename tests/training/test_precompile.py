@@ -3,34 +3,48 @@
 import json
 import re
 import sys
+from dataclasses import replace
 
 import pytest
 from processes import run_compiled
 
-from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
-from hgn.schema import from_mapping, to_mapping
-from hgn.training.precompile import Precompilation, PrecompileJob, job_of_training
+from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig, config_directory
+from hgn.hydra_compat import compose
+from hgn.schema import from_mapping
+from hgn.training.precompile import Precompilation, sizes_of
 
 
 def job(batch_scenes=8):
     training = TrainingConfig(batch_scenes=batch_scenes, precision="fp16")
-    config = TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
-    return job_of_training(config, (9, 0), False)
+    return TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
 
 
-def test_the_job_follows_from_the_configuration():
-    """Sizes are those of the scenes' distribution as it begins, to a few per cent, and the job survives its text."""
-    made = job()
-    assert made.precision == "fp16" and made.capability == 90 and made.settings.scenes == 8
-    assert made.particles == pytest.approx(8 * 4296, rel=0.05)
-    assert made.cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
-    assert from_mapping(PrecompileJob, json.loads(json.dumps(to_mapping(made)))) == made
+def test_sizes_follow_from_the_configuration():
+    """Sizes are those of the distribution of scenes at their start, to a few per cent."""
+    particles, cells = sizes_of(job())
+    assert particles == pytest.approx(8 * 4296, rel=0.05)
+    assert cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
+
+
+@pytest.mark.parametrize("experiment", ["obstacles", "mechanics", "own_physics"])
+def test_processes_compile_the_kernels_of_the_training(experiment, monkeypatch):
+    """Each process reads the whole configuration, its part, the GPU's capability, and whether there are more ranks."""
+    (mapping,) = compose(config_directory(), "train", ["train", f"experiment={experiment}"])
+    given = from_mapping(TrainConfig, {key: mapping[key] for key in mapping if key not in ("name", "run")})
+    given = replace(given, training=replace(given.training, precision="fp16"))
+    seen = []
+    monkeypatch.setattr("hgn.training.precompile.Program", lambda command, _, text: seen.append((command, text)))
+    Precompilation(given, (9, 0), True, 2)._files.close()
+    assert len(seen) == 2
+    for part, (command, text) in enumerate(seen):
+        assert command[-4:] == [str(part), "2", "90", "1"]
+        assert from_mapping(TrainConfig, json.loads(text)) == given
 
 
 @pytest.mark.parametrize(
     ("program", "interrupted", "expected"),
     [  # each process gets its share and the job; the counts of all are told together
-        ("assert 'fp16' in sys.stdin.read(); print(10 + sum(map(int, sys.argv[1:])))", False, "25 kernels ready"),
+        ("assert 'fp16' in sys.stdin.read(); print(10 + sum(map(int, sys.argv[1:3])))", False, "25 kernels ready"),
         (
             "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)",
             False,
@@ -42,7 +56,7 @@ def test_the_job_follows_from_the_configuration():
 def test_what_is_told(program, interrupted, expected):
     """What was compiled is counted; when a process fails, its exit code and last line are told, and that nothing is
     lost; whoever is interrupted waits no longer, and no process is left."""
-    ahead = Precompilation(job(), 2, (sys.executable, "-c", f"import sys; {program}"))
+    ahead = Precompilation(job(), (9, 0), False, 2, (sys.executable, "-c", f"import sys; {program}"))
     try:
         assert re.search(expected, ahead.wait(lambda: interrupted)) and not ahead.running
     finally:

@@ -6,8 +6,7 @@ Shape legend: N particles of all scenes, S scenes.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -21,7 +20,7 @@ from tools.bench.contenders import OBSTACLE_CELL_SIZE, Contender, bench_network,
 from tools.bench.states import Workload, batch_of, state_of
 
 if TYPE_CHECKING:
-    from hgn.kernels.update.op import DeviceEpisode
+    from hgn.kernels.update.op import DeviceEpisode, Updates
 
 FRAMES_AT_ONCE = 16  # at most; a frame is launched while the frame before runs, as in a simulation
 UPDATES_AT_ONCE = 20
@@ -81,21 +80,15 @@ def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:
 
 
 def triton_updates(
-    network: ParticleNetwork, scenes: int, precision: str, device: torch.device, noise_std: float | None = None
-) -> Callable[..., Any]:
-    """Returns a maker of updates of `scenes` scenes, each with its own network; without jitter if `noise_std` is 0."""
-    from hgn.kernels.update.op import Updates, UpdateSettings  # loads Triton
+    network: ParticleNetwork, training: TrainingConfig, precision: str, device: torch.device, **more: Any
+) -> Updates:
+    """Returns updates with their own network. `more` are further arguments of Updates."""
+    from hgn.kernels.update.op import Updates  # loads Triton
 
     assert isinstance(network, HierarchicalGraphNetwork)
-    noise_std = TrainingConfig.noise_std if noise_std is None else noise_std
-    return partial(
-        Updates,
-        copy.deepcopy(network),
-        UpdateSettings(scenes, noise_std, noise_std > 0, OBSTACLE_CELL_SIZE),
-        kernel_precision(precision, device),
-        torch.zeros(2, device=device),
-        torch.zeros(5, device=device),
-    )
+    sums = torch.zeros(2, device=device), torch.zeros(5, device=device)
+    precision = kernel_precision(precision, device)
+    return Updates(copy.deepcopy(network), training, OBSTACLE_CELL_SIZE, precision, *sums, **more)
 
 
 class TritonTrain(Contender):
@@ -104,20 +97,19 @@ class TritonTrain(Contender):
     at_once = UPDATES_AT_ONCE
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str) -> None:
-        self.device, self.precision = device, precision
+        self.device = device
         self.batch = batch_of(work, config, device)
         self.network = bench_network(config, device)
         self.samples = device_samples(self.batch)
-        self.updates = self._updates()
-
-    def _updates(self, noise_std: float | None = None) -> Any:
-        return triton_updates(self.network, len(self.samples), self.precision, self.device, noise_std)()
+        self.training = TrainingConfig(batch_scenes=work.scenes, noise_correlated_fraction=0.0)
+        self.updates = triton_updates(self.network, self.training, precision, device)
 
     def run(self) -> None:
         self.updates.run([self.samples] * UPDATES_AT_ONCE, [TrainingConfig.learning_rate] * UPDATES_AT_ONCE)
 
     def check(self, precision: str) -> str:
-        plain = self._updates(noise_std=0.0)
+        plain = triton_updates(self.network, replace(self.training, noise_std=0.0), precision, self.device)
+        plain.jitter = False
         plain.run([self.samples], [0.0])
         gradients = [torch.zeros_like(parameter) for parameter in self.network.parameters()]
         plain.packed.scatter(plain.first_moment / FIRST_MOMENT_FRACTION, gradients)

@@ -9,16 +9,13 @@ from typing import Any
 import torch
 import torch.multiprocessing
 
-from hgn.config import TrainingConfig
+from hgn.config import SceneConfig, TrainConfig, TrainingConfig
 from hgn.schema import from_mapping, require
 from hgn.system.files import write_json
 from tools import report
-from tools.bench.contenders import OBSTACLE_CELL_SIZE
 from tools.report import EXIT_RED, PASS
 from tools.scaling.config import ScalingConfig
 from tools.scaling.measure import measure
-
-CELL_FRACTION = 0.3  # cells of the finest level per particle of tools.bench.states, about
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -50,17 +47,12 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
     if device_type == "cpu" or "triton" not in config.backends or torch.version.hip is not None:
         return
     # Triton, which backend torch does without, is loaded here.
-    from hgn.kernels.update.op import UpdateSettings
-    from hgn.training.precompile import Precompilation, PrecompileJob
+    from hgn.training.precompile import Precompilation
 
-    training = TrainingConfig(batch_scenes=config.scenes)
-    settings = UpdateSettings(config.scenes, training.noise_std, True, OBSTACLE_CELL_SIZE)
-    particles = config.scenes * config.particles
-    cells = tuple(max(1, int(CELL_FRACTION * particles) >> 2 * level) for level in range(config.network.levels))
-    major, minor = torch.cuda.get_device_capability()
-    capability = 10 * major + minor
-    job = PrecompileJob(config.network, settings, config.precision, count > 1, False, particles, cells, capability)
-    with Precompilation(job) as precompilation:
+    training = TrainingConfig(batch_scenes=config.scenes, precision=config.precision, noise_correlated_fraction=0.0)
+    scene = SceneConfig(obstacle_count=0)  # for any network
+    job = TrainConfig(scene, network=config.network, training=training, imported=True)
+    with Precompilation(job, torch.cuda.get_device_capability(), count > 1) as precompilation:
         print(precompilation.wait(), file=sys.stderr)
 
 

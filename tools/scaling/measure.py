@@ -114,7 +114,8 @@ class TritonUpdates:
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         network = bench_network(config.network, device)
-        self.make = triton_updates(network, config.scenes, config.precision, device)
+        training = TrainingConfig(batch_scenes=config.scenes, noise_correlated_fraction=0.0)
+        self.make = partial(triton_updates, network, training, config.precision, device)
         self.ours = self.make()
         self.chunk = [device_samples(batch) for batch in batches]
         self.rates = [TrainingConfig.learning_rate] * len(self.chunk)
@@ -122,7 +123,7 @@ class TritonUpdates:
     def average(self, group: dist.ProcessGroup) -> None:
         """Averages gradients over the ranks of `group` from now on."""
         reduce = partial(dist.all_reduce, group=group)
-        self.ours = self.make(reduce, dist.get_world_size(group))
+        self.ours = self.make(reduce=reduce, ranks=dist.get_world_size(group))
         self.gradients()
 
     def run(self) -> None:

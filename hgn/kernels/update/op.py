@@ -50,7 +50,7 @@ class DeviceEpisode:
     obstacles: SceneHash | None
     domain_size: Vector
     gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; only relative inputs use it
-    symmetries: tuple[Symmetry, ...] = ()  # if settings.symmetry is set, one of them is drawn for each sample
+    symmetries: tuple[Symmetry, ...] = ()  # with training.symmetry one of them is drawn for each sample
     barrier: SceneHash | None = None  # the barrier of the episode's simulations
     wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
     parameter_NP: torch.Tensor | None = None  # float32, columns of hgn.network.own_physics; None: all are 0
@@ -90,30 +90,10 @@ class DeviceSample(NamedTuple):
     frame: int
     seed: int  # seed of noise, jitter and symmetry
     weight: float = 1.0  # weight of this sample in the loss
-    noise_scale: float = 1.0  # standard deviation of the noise in units of settings.noise_std
+    noise_scale: float = 1.0  # standard deviation of the noise in units of training.noise_std
 
 
 AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
-
-
-@dataclass(frozen=True)
-class UpdateSettings:
-    """Holds the settings of hgn.config.TrainingConfig that an update depends on."""
-
-    scenes: int
-    noise_std: float
-    grid_jitter: bool
-    obstacle_cell_size: float
-    symmetry: bool = False
-    noise_correlated_fraction: float = 0.0
-    optimizer: str = "adam"
-
-    @staticmethod
-    def of(training: TrainingConfig, obstacle_cell_size: float) -> "UpdateSettings":
-        return UpdateSettings(
-            training.batch_scenes, training.noise_std, True, obstacle_cell_size,
-            training.symmetry != "none", training.noise_correlated_fraction, optimizer=training.optimizer,
-        )  # fmt: skip
 
 
 class Updates:
@@ -125,11 +105,13 @@ class Updates:
 
     grid: DeviceGrid
     fused: FusedTrainingNetwork
+    jitter = True  # whether the grids begin at random places; comparisons with other updates set it to False
 
     def __init__(
         self,
         network: HierarchicalGraphNetwork,
-        settings: UpdateSettings,
+        training: TrainingConfig,
+        obstacle_cell_size: float,
         precision: str,
         loss_sum: torch.Tensor,
         counters: torch.Tensor,
@@ -138,23 +120,25 @@ class Updates:
         capacities: tuple[int, ...] = (),
     ) -> None:
         """Takes the initial number of cells of each level from `capacities`, or measures it at the first update."""
-        self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
+        self.network, self.config, self.training, self.precision = network, network.config, training, precision
+        self.scenes, self.symmetry = training.batch_scenes, training.symmetry != "none"
+        self.obstacle_cell_size = obstacle_cell_size
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
         self.device = device = next(network.parameters()).device
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self.average: torch.Tensor | None = None  # moving average of the values; assigned before the first update
-        muon = settings.optimizer == "muon"
+        muon = training.optimizer == "muon"
         self.blocks = SquareBlocks(network, self.packed.index, device) if muon else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
-        scenes, normaliser = settings.scenes, network.normaliser
+        scenes, normaliser = self.scenes, network.normaliser
         columns = 4 + 3 * self.config.velocity_history  # wave vector, phase, and a change of amplitude per velocity
         self.waves_SKC = torch.zeros(scenes, CORRELATED_WAVES, columns, device=device)
         sees = self.config.obstacle_features
-        table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, settings.obstacle_cell_size)
+        table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, obstacle_cell_size)
         self.obstacles, self._obstacle_row = table if sees else None, table.row_SC
         self.moving: MovingTable | None = None
         mean_3, std_3 = normaliser.feature_scale(self.config.relative)
@@ -212,7 +196,7 @@ class Updates:
 
     def _upload(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> int:
         """Writes the tables of the chunk, and returns the largest number of particles of an update."""
-        scenes, history = self.settings.scenes, self.config.velocity_history
+        scenes, history = self.scenes, self.config.velocity_history
         assert all(len(samples) == scenes for samples in chunk)
         flat = [DeviceSample(*sample) for samples in chunk for sample in samples]
         # The kernels read raw addresses and check no bounds. The host therefore checks them here.
@@ -226,7 +210,7 @@ class Updates:
         real = np.array([(sample.weight, sample.noise_scale) for sample in flat], np.float64)
         table[..., 5:7] = real.view(np.int64).reshape(*count.shape, 2)
         shown = [Symmetry()] * len(flat)
-        if self.settings.symmetry:
+        if self.symmetry:
             shown = [drawn_symmetry(sample.episode.symmetries, sample.seed) for sample in flat]
             table[..., -1] = np.array([symmetry.code for symmetry in shown]).reshape(count.shape)
         vectors = np.zeros((len(flat), 3, 3), np.float32)
@@ -255,12 +239,12 @@ class Updates:
         table, updates = self.moving, len(self._rates)
         layers = layers if table is None else max(layers, table.layers)
         if layers and (table is None or layers > table.layers or updates > len(table.record_TVR)):
-            self._graphs, size = [], self.settings.obstacle_cell_size  # the graphs read the old records
-            self.moving = MovingTable(self.update, updates, self.settings.scenes, layers, size)
+            self._graphs, size = [], self.obstacle_cell_size  # the graphs read the old records
+            self.moving = MovingTable(self.update, updates, self.scenes, layers, size)
 
     def _allocate_tables(self, length: int) -> None:
         self._graphs = []  # the graphs read the old tables
-        shape = (length, self.settings.scenes)
+        shape = (length, self.scenes)
         self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
         self._vectors = torch.zeros(*shape, 3, 3, device=self.device)
         self._rates, self._shares = (torch.zeros(length, device=self.device) for _ in range(2))
@@ -336,16 +320,16 @@ class Updates:
 
     def _assemble(self) -> None:
         """Launches the assembly of the samples: windows, symmetry, noise and jitter. The rule is hgn.training.noise."""
-        settings, config = self.settings, self.config
-        correlated, steps = settings.noise_correlated_fraction, config.velocity_history
-        wave_step = settings.noise_std * math.sqrt(2 / CORRELATED_WAVES * correlated / steps)
-        own_step = settings.noise_std * math.sqrt((1 - correlated) / steps)
+        training, config = self.training, self.config
+        correlated, steps = training.noise_correlated_fraction, config.velocity_history
+        wave_step = training.noise_std * math.sqrt(2 / CORRELATED_WAVES * correlated / steps)
+        own_step = training.noise_std * math.sqrt((1 - correlated) / steps)
         if wave_step > 0:
             shortest, longest = (cells * config.cell_size for cells in CORRELATED_WAVELENGTHS)
-            kernel.draw_waves[(settings.scenes,)](
+            kernel.draw_waves[(self.scenes,)](
                 samples=self._samples, update=self.update, waves=self.waves_SKC, amplitude_step=wave_step,
                 largest_number=2 * math.pi / shortest, log_range=math.log(longest / shortest),
-                scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=CORRELATED_WAVES,
+                scenes=self.scenes, HISTORY=config.velocity_history, WAVES=CORRELATED_WAVES,
             )  # fmt: skip
         walls, parameter_NP, rest_NR = self.buffers.wall_friction_S3, self.buffers.parameter_NP, self.buffers.rest_NR
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
@@ -354,21 +338,21 @@ class Updates:
             target=self.target_N3, share_of=self.share_N, origin=self.buffers.origin_S3, domain=self.buffers.domain_S3,
             gravity=self.buffers.gravity_S3, obstacle_table=self._obstacle_row, particle_count=self.buffers.count,
             mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
-            jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
+            jitter=config.cell_size if self.jitter else 0.0, scenes=self.scenes,
             wall_friction=self.buffers.domain_S3 if walls is None else walls,
             parameter_of=self.share_N if parameter_NP is None else parameter_NP,
             rest_of=self.buffers.scene_N if rest_NR is None else rest_NR,
-            obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
-            SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
+            obstacle_cell_size=self.obstacle_cell_size, HISTORY=config.velocity_history,
+            SYMMETRY=self.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
             FRICTION=walls is not None, PARAMETERS=physics_widths(config)[1],
             WIDTH=0 if parameter_NP is None else parameter_NP.shape[1], REST=rest_NR is not None,
-            DIMENSIONS=config.dimensions, SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
+            DIMENSIONS=config.dimensions, SCENES=triton.next_power_of_2(self.scenes), BLOCK=BLOCK,
         )  # fmt: skip
 
     def _grid(self) -> None:
         """Builds the grid, and computes the cells and the features of the particles."""
         self.grid.build(self.buffers)
-        self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry, self.moving)
+        self.grid.prepare(self.buffers, self.scale, self.obstacles, self.symmetry, self.moving)
 
     # window and buffers
 
@@ -383,7 +367,7 @@ class Updates:
             del self.fused, self.grid  # frees the old buffers before the allocation of the new ones
         self._built_reach = self._reach
         self.buffers = DeviceParticles.empty(
-            particles, self.settings.scenes, config.velocity_history, device, config.own_physics
+            particles, self.scenes, config.velocity_history, device, config.own_physics
         )
         self.target_N3 = torch.zeros(particles, 3, device=device)
         self.share_N = torch.zeros(particles, device=device)
@@ -403,7 +387,7 @@ class Updates:
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
         config, (lower, upper) = self.config, self._reach
         window = Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
-        return DeviceGrid(config, window, capacities, self.settings.scenes, self.particles, self.device)
+        return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device)
 
     def _make_room(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
