@@ -20,7 +20,7 @@ from hgn.training.checkpoint import AVERAGED, NETWORK, SECTION, DataInfo, Progre
 from hgn.training.pushforward import SimulationStoppedError
 from hgn.training.schedule import learning_rate
 from hgn.training.torch_updates import TorchUpdates
-from hgn.training.updates import Ranks, TrainedNetwork, Updates, build_optimizer
+from hgn.training.updates import TrainedNetwork, Updates, build_optimizer
 
 
 class TrainingModule(LightningModule):
@@ -114,10 +114,8 @@ class TrainingModule(LightningModule):
             # imported here, because backend torch does without Triton
             from hgn.training.triton_updates import TritonUpdates
 
-            ranks = Ranks(rank, self.trainer.world_size)
-            self.updates = TritonUpdates(
-                trained, config, self.data.obstacle_cell_size, ranks, precisions=self._precisions
-            )
+            size, ranks = self.data.obstacle_cell_size, self.trainer.world_size
+            self.updates = TritonUpdates(trained, config, size, rank, world_size=ranks, precisions=self._precisions)
 
     def training_step(self, chunk: WindowChunk | EpisodeChunk) -> None:
         try:

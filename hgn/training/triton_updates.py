@@ -29,7 +29,7 @@ from hgn.training.parity import require_update_parity
 from hgn.training.pushforward import PushforwardPool
 from hgn.training.schedule import average_weight, learning_rate
 from hgn.training.triton_pushforward import TritonScenes
-from hgn.training.updates import Ranks, TrainedNetwork
+from hgn.training.updates import TrainedNetwork
 
 REPORTED_UPDATES = 256  # number of first updates whose times are printed; they are the slowest
 DATA_FRACTION = 0.6  # largest fraction of a GPU's memory that episodes use; other episodes stay in host memory
@@ -43,13 +43,15 @@ class TritonUpdates:
         trained: TrainedNetwork,
         training: TrainingConfig,
         obstacle_cell_size: float,
-        ranks: Ranks,
+        rank: int = 0,
+        *,
+        world_size: int = 1,
         precisions: tuple[str, ...] = ("fp32",),
     ) -> None:
         """`precisions` are tried in order. Training uses the first one whose kernels agree with PyTorch."""
         self._start_s, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
-        self.training, self._ranks = training, ranks
+        self.training, self._rank, self._world_size = training, rank, world_size
         assert isinstance(trained.network, HierarchicalGraphNetwork)
         self.network, self.optimizer = trained.network, trained.optimizer
         self.device = next(self.network.parameters()).device
@@ -63,7 +65,7 @@ class TritonUpdates:
 
     def _build(self, precision: str) -> None:
         """Builds the updates and simulations of this precision from the network's present parameters."""
-        trained, training, ranks = self._trained, self.training, self._ranks
+        trained, training = self._trained, self.training
         self.precision = precision
         self.updates = Updates(
             self.network,
@@ -72,8 +74,8 @@ class TritonUpdates:
             kernel_precision(precision, self.device),
             loss_sum=trained.loss_sum,
             counters=trained.counters,
-            reduce=sum_over_ranks if ranks.count > 1 else None,
-            ranks=ranks.count,
+            reduce=sum_over_ranks if self._world_size > 1 else None,
+            ranks=self._world_size,
         )
         self._read_moments()
         if self._averaged is not None:
@@ -83,7 +85,7 @@ class TritonUpdates:
             simulated = trained.result
             assert isinstance(simulated, HierarchicalGraphNetwork)
             self._scenes = TritonScenes(simulated, training, self._obstacle_cell_size, precision)
-            self.pool = PushforwardPool(self._scenes, training, ranks.rank)
+            self.pool = PushforwardPool(self._scenes, training, self._rank)
 
     def run(self, chunk: EpisodeChunk, first_update: int) -> None:
         """Raises: ConfigError for positions that are not finite; ParityError if no precision passes the first check."""
@@ -125,7 +127,7 @@ class TritonUpdates:
         except ParityError as error:
             failure = str(error)  # a stored error would keep the graphs in memory
         failures = torch.tensor(float(failure != ""), device=self.device)
-        if self._ranks.count > 1:
+        if self._world_size > 1:
             sum_over_ranks(failures)
         if failures > 0:
             failure = failure or "the kernels failed the check on another rank, whose message contains the error"
@@ -142,7 +144,7 @@ class TritonUpdates:
         self._say(text if math.isfinite(outputs) else "batch too large to check")
 
     def _say(self, text: str) -> None:
-        if self._ranks.rank == 0:
+        if self._rank == 0:
             print(f"backend triton: {text}", file=sys.stderr)
 
     @contextmanager

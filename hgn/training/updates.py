@@ -33,14 +33,6 @@ class TrainedNetwork:
         return self.network if self.averaged is None else self.averaged
 
 
-@dataclass(frozen=True)
-class Ranks:
-    """This process and the number of processes that train together."""
-
-    rank: int = 0
-    count: int = 1
-
-
 class Updates(Protocol):
     """Trains on chunks of samples."""
 

@@ -26,7 +26,7 @@ from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import TritonStepper
 from hgn.step.reference import accelerations, advanced
 from hgn.training.triton_updates import TritonUpdates
-from hgn.training.updates import Ranks, TrainedNetwork
+from hgn.training.updates import TrainedNetwork
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -167,7 +167,7 @@ def test_wrong_poses_train_nothing(broken, monkeypatch):
     loss_sum, counters = torch.zeros(2, device=device()), torch.zeros(5, device=device())
     parts = TrainedNetwork(network, torch.optim.Adam(network.parameters()), loss_sum, counters)
     training = TrainingConfig(batch_scenes=2, noise_std=0.0, symmetry="gravity", precision="fp32")
-    fast = TritonUpdates(parts, training, CELL_SIZE, Ranks())
+    fast = TritonUpdates(parts, training, CELL_SIZE)
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
     chunk = EpisodeChunk((tuple(Sample(i, 6, i) for i in range(2)),), wholes, SamplerState())
     with pytest.raises(ParityError, match="outputs differ"):

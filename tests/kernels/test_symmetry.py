@@ -24,7 +24,7 @@ from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.training.symmetry import under_symmetries
 from hgn.training.triton_updates import TritonUpdates
-from hgn.training.updates import Ranks, TrainedNetwork
+from hgn.training.updates import TrainedNetwork
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -72,7 +72,7 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, distance, monk
     loss_sum, counters = torch.zeros(2, device=device()), torch.zeros(5, device=device())
     without_jitter(monkeypatch)
     parts = TrainedNetwork(trained, torch.optim.Adam(trained.parameters()), loss_sum, counters)
-    fast = TritonUpdates(parts, training, CELL_SIZE, Ranks())
+    fast = TritonUpdates(parts, training, CELL_SIZE)
     samples = tuple(Sample(i, FRAME, seed) for i, seed in enumerate(seeds))
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
     fast.run(EpisodeChunk((samples,), wholes, SamplerState()), 0)
