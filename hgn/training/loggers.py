@@ -26,6 +26,17 @@ MOST_WAITING = 10_000  # calls that wait for a logger; later ones are dropped
 Builder = Callable[[Path, dict[str, Any]], Logger]
 
 
+def _tensorboard(run: Path, settings: dict[str, Any]) -> Logger:
+    printed = threading.excepthook
+
+    def hook(fault: threading.ExceptHookArgs) -> None:
+        if not type(fault.thread).__module__.startswith("tensorboard."):  # its next call raises its fault again
+            printed(fault)
+
+    threading.excepthook = hook
+    return TensorBoardLogger(run, name="", version="tensorboard")
+
+
 def _wandb(run: Path, settings: dict[str, Any]) -> Logger:
     # otherwise a process whose server is unreachable would never end
     os.environ.setdefault("WANDB_FINISH_TIMEOUT", f"{standard_patience_s():.0f}")
@@ -51,7 +62,7 @@ def _mlflow(run: Path, settings: dict[str, Any]) -> Logger:
 
 
 BUILDERS: dict[str, Builder] = {
-    "tensorboard": lambda run, settings: TensorBoardLogger(run, name="", version="tensorboard"),
+    "tensorboard": _tensorboard,
     "wandb": _wandb,
     "mlflow": _mlflow,
 }

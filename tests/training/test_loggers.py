@@ -87,6 +87,20 @@ def test_a_logger_that_fails_ends_nothing(data, tmp_path, stand_in, capsys, faul
         assert len([None for method, _ in made[0].calls if method == "metrics"]) > 2
 
 
+def test_tensorboard_on_a_full_disk(data, tmp_path, monkeypatch, capsys):
+    """One line reports the fault of TensorBoard's own thread, without a traceback, and the training ends as ever."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tensorboard.summary.writer.record_writer.RecordWriter.write", full)
+    assert train.main(train_mapping(data, tmp_path / "run", loggers=["tensorboard"])) == 0
+    lines = capsys.readouterr().err.splitlines()
+    told = [line for line in lines if "tensorboard" in line or "No space" in line or "Traceback" in line]
+    assert len(told) == 1 and "tensorboard fails: [Errno 28] No space left on device; training continues" in told[0]
+    assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [4, 8, 12]
+
+
 def test_a_logger_that_hangs_delays_nothing(data, tmp_path, stand_in, monkeypatch, capsys):
     """No update waits for it. At the end the training waits for it as long as for storage."""
     made, released, waiting = stand_in(), threading.Event(), []
