@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_206,
-    "datagen": 8_905,
+    "hgn": 34_226,
+    "datagen": 8_912,
     "tools": 6_329,
-    "tests": 35_241,
+    "tests": 35_269,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

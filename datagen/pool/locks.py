@@ -1,8 +1,9 @@
 """Locks episodes, so that several generators share one folder without a coordinator.
 
 Locks are on bytes of the data set's file `.lock`. A process that changes the manifest locks byte 0. All generators
-share a lock on byte 1. Each episode has a byte of its own, locked by the generator that makes the episode. The kernel
-releases the locks of a process at its end, also after a crash. So no claim becomes stale, and no clock is needed.
+share a lock on byte 1, and one on the folder, which shows that `.lock` was deleted. Each episode has a byte of its own,
+locked by the generator that makes the episode. The kernel releases the locks of a process at its end, also after a
+crash. So no claim becomes stale, and no clock is needed.
 """
 
 import contextlib
@@ -14,7 +15,7 @@ from pathlib import Path
 from datagen.pool.plan import ShardRange
 from hgn.data.manifest import SPLITS
 from hgn.schema import ConfigError
-from hgn.system.locks import NO_LOCKS, lock_bytes, open_lock
+from hgn.system.locks import NO_LOCKS, lock_bytes, lock_if_supported, open_lock
 
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
@@ -23,18 +24,28 @@ _EPISODES_OF_A_SPLIT = 1 << 40  # bytes between the first episodes of two splits
 
 
 class ShardLocks:
-    """Manages one generator's locks on a folder. It is a context manager."""
+    """Manages one generator's locks on a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises: ConfigError if the file system has no locks, or grants a lock twice."""
+        """Raises: ConfigError if the file system has no locks, or grants a lock twice, or if `.lock` was deleted."""
         self._path = folder / LOCK_NAME
-        self._file = open_lock(self._path)
-        try:
+        with contextlib.ExitStack() as stack:
+            opened = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, opened)
+            first = lock_if_supported(opened)
+            if not first:
+                lock_if_supported(opened, fcntl.LOCK_SH)  # waits until the first generator has made the file
+            if not first and not self._path.exists():
+                raise ConfigError(
+                    f"{self._path} must exist while generators run in its folder, got none: it was deleted; "
+                    "wait for their end, or end them, and run the same command again"
+                )
+            self._file = open_lock(self._path)
+            stack.callback(os.close, self._file)
+            lock_if_supported(opened, fcntl.LOCK_SH)
             self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE, wait=True)
             self._require_exclusion()
-        except BaseException:
-            os.close(self._file)
-            raise
+            self.close = stack.pop_all().close  # frees every lock
 
     def _require_exclusion(self) -> None:
         """Raises ConfigError if a lock does not exclude others. Generators would overwrite each other's files."""
@@ -47,10 +58,6 @@ class ShardLocks:
                 )
         finally:
             os.close(other)
-
-    def close(self) -> None:
-        """Frees every lock."""
-        os.close(self._file)
 
     @contextlib.contextmanager
     def manifest(self) -> Iterator[None]:

@@ -44,6 +44,21 @@ def lock_file(file: IO[Any] | int) -> bool:
     return True
 
 
+def lock_if_supported(opened: int, kind: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> bool:
+    """Locks an open file or folder. Returns False if another process has the lock.
+
+    On a file system without locks, or without locks of folders, every process succeeds.
+    """
+    try:
+        fcntl.flock(opened, kind)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in (*NO_LOCKS, errno.EBADF):  # EBADF is the error of folders on NFS
+            raise
+    return True
+
+
 def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = False) -> bool:
     """Locks bytes of an open file, which need not exist. Returns False if others have the lock and `wait` is False.
 
@@ -93,13 +108,7 @@ def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
         for opening in (partial(open_lock, path), partial(os.open, path.parent, os.O_RDONLY)):
             opened = opening()
             stack.callback(os.close, opened)
-            try:
-                free = lock_file(opened)
-            except OSError as error:
-                if error.errno not in (*NO_LOCKS, errno.EBADF):  # EBADF is the error of folders on NFS
-                    raise
-                free = True
-            if not free:
+            if not lock_if_supported(opened):
                 raise ConfigError(
                     f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=..."
                 )

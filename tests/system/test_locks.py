@@ -24,6 +24,20 @@ def test_a_deleted_lock_file_locks(tmp_path):
         pass
 
 
+def test_a_deleted_lock_file_of_generators(tmp_path):
+    """A generator that starts after `.lock` was deleted is refused until the others end; they would overwrite each
+    other's files."""
+    locks = [ShardLocks(tmp_path) for _ in range(2)]
+    (tmp_path / ".lock").unlink()
+    for each in locks:
+        with pytest.raises(ConfigError, match=r"\.lock must exist while generators run .* wait for their end"):
+            ShardLocks(tmp_path)
+        assert not (tmp_path / ".lock").exists()
+        each.close()
+    for each in [ShardLocks(tmp_path) for _ in range(2)]:
+        each.close()
+
+
 def test_a_deleted_folder_is_locked_again(tmp_path):
     """The one that is made in its place, unless another process has made and locked it before."""
     run = tmp_path / "run"
