@@ -1,4 +1,4 @@
-"""The network that a configuration names."""
+"""Builds the network of a configuration."""
 
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork

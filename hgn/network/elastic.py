@@ -1,7 +1,7 @@
 """The deformation of elastic bodies as inputs of a network with relative inputs (`network.own_physics: elastic`).
 
-An elastic particle keeps NEIGHBOURS particles of its body from the rest shape. X are their places relative to it at
-rest, x those in the present frame, both as rows. Least squares give the deformation gradient F with x = F X:
+Each elastic particle has NEIGHBOURS rest neighbours, particles of its body. X are their positions relative to it in
+the rest shape, x those in the present frame, both as rows. Least squares give the deformation gradient F with x = F X:
 
     F = sum_k x_k g_k^T,    g_k = A^-1 X_k,    A = sum_k X_k X_k^T
     e = mean_k (x_k - F X_k) = sum_k x_k c_k,    c_k = 1 / K - g_k . mean X
@@ -37,12 +37,12 @@ class RestShape:
     """The neighbours of elastic particles in the rest shape. Other particles have no neighbours and coefficients 0."""
 
     neighbour_NK: torch.Tensor  # int64, row of the neighbour; -1: none
-    position_N3: torch.Tensor  # float32, place at rest
+    position_N3: torch.Tensor  # float32, rest position
     coefficient_NK4: torch.Tensor  # float32, g and c
 
     @staticmethod
     def of(position_N3: torch.Tensor, neighbour_NK: torch.Tensor) -> RestShape:
-        """Returns the rest shape of particles with these places and neighbours."""
+        """Returns the rest shape of particles with these rest positions and neighbours."""
         offset_NK3 = (position_N3[neighbour_NK.clamp(min=0)] - position_N3[:, None]).double()
         there_NK = (neighbour_NK >= 0).double()
         offset_NK3 = offset_NK3 * there_NK[..., None]
@@ -67,7 +67,7 @@ class RestShape:
 
     @staticmethod
     def unpacked(packed_NR: torch.Tensor, position_N3: torch.Tensor) -> RestShape:
-        """Returns the shape of `packed`. The places are used only if particles lose neighbours."""
+        """Returns the shape of `packed`. The positions are used only if particles lose neighbours."""
         coefficient_NR = packed_NR[:, NEIGHBOURS:].contiguous().view(torch.float32)
         return RestShape(packed_NR[:, :NEIGHBOURS].long(), position_N3, coefficient_NR.unflatten(1, (NEIGHBOURS, 4)))
 
@@ -113,7 +113,7 @@ _TENSORS = ("neighbour_NK", "position_N3", "coefficient_NK4")
 
 
 def elastic_columns(position_N3: torch.Tensor, rest: RestShape, scale: torch.Tensor) -> torch.Tensor:
-    """Returns the columns [N, COLUMNS] of particles at these places. `scale` is s_a."""
+    """Returns the columns [N, COLUMNS] of particles at these positions. `scale` is s_a."""
     count = position_N3.shape[0]  # len() would fix the size of an exported graph
     own_N1 = torch.arange(count, device=position_N3.device)[:, None]
     offset_NK3 = position_N3[torch.where(rest.neighbour_NK < 0, own_N1, rest.neighbour_NK)] - position_N3[:, None]

@@ -43,7 +43,7 @@ class Level:
     receiver_E: torch.Tensor
     direction_E: torch.Tensor  # row of DIRECTION_63
     parent_C: torch.Tensor | None = None  # index into the next level; None on the coarsest
-    octant_C: torch.Tensor | None = None  # row of CORNER_83: the cell's place in its parent
+    octant_C: torch.Tensor | None = None  # row of CORNER_83: the cell's position in its parent
 
     @property
     def cell_count(self) -> int:
@@ -76,7 +76,7 @@ class GridHierarchy:
 
     @cached_property
     def coarsest_places(self) -> torch.Tensor:
-        """Returns the particles' places relative to the centres of `coarsest_cells`, in cell edges, [N, 8, 3]."""
+        """Returns the particles' positions relative to the centres of `coarsest_cells`, in cell edges, [N, 8, 3]."""
         corner_83 = CORNER_83.to(self.fraction_N3)
         place_N83, cell_N8 = self.fraction_N3[:, None] - corner_83, self.cell_N8
         for level in self.levels[:-1]:
@@ -96,8 +96,8 @@ def build_hierarchy(
 ) -> GridHierarchy:
     """Builds the grids of all scenes. Cells of different scenes are never neighbours.
 
-    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins. `bodies`
-    divides the cells among bodies.
+    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins. With
+    `bodies` cells of different bodies are different cells.
     Raises: GridRangeError if a particle is not finite, or 65,534 cells or more from the origin on an axis.
     """
     grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5

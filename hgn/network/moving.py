@@ -1,16 +1,16 @@
 """Obstacles in motion as inputs of a network with `moving` in `network.own_physics`.
 
-The cells of a moving obstacle are computed once, at its place in the scene. Particles are looked up in coordinates that
-move with the obstacle, so its cells move exactly. Until the next frame the obstacle's points move by
+The cells of a moving obstacle are computed once, in the pose of the scene file. Particles are looked up in coordinates
+that move with the obstacle, so its cells move exactly. Until the next frame the obstacle's points move by
 
     V(x) = A (x - p) + b,    A = R' R^T - 1,    b = p' - p
 
-R and p are the obstacle's rotation and the place of its pivot in this frame, R' and p' those one frame later; b is in
+R and p are the obstacle's rotation and its pivot's position in this frame, R' and p' those one frame later; b is in
 domain units per frame. A particle at x moves relative to the obstacle by v - V(x). docs/concepts/method.md lists where
 the network uses v - V.
 
 Tensors have one row for each obstacle. Obstacle j of scene s has row j S + s. Scenes with fewer than J moving
-obstacles have rows without cells. The key of a cell or triangle contains its place and a number: its scene's for
+obstacles have rows without cells. The key of a cell or triangle contains its coordinates and a number: its scene's for
 obstacles at rest, its row's for moving obstacles.
 Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, C coarsest cells, V (in names of
 tensors) J S rows. K columns: three of the normal, one of friction; if there are 7, also three of the velocity V(x).
@@ -83,7 +83,7 @@ class Poses:
         return turned(position_V3 - self.pivot_V3, self.rotation_V33) + self.place_V3
 
     def velocity(self, position_V3: torch.Tensor) -> torch.Tensor:
-        """Returns the displacement V of the obstacle's points at these places until the next frame."""
+        """Returns the displacement V of the obstacle's points at these positions until the next frame."""
         return turned(position_V3 - self.place_V3, self.change_V33) + self.shift_V3
 
 
@@ -98,7 +98,7 @@ class MovingObstacles:
     scenes: tuple[tuple[MovingObstacle, ...], ...]
     frames: tuple[int, ...]
     frame_s: float
-    cells: ObstacleCells | None  # at the obstacles' places in the scenes; None for a network without obstacle features
+    cells: ObstacleCells | None  # in the poses of the scene files; None for a network without obstacle features
     barriers: Barriers | None  # likewise; only with step.obstacle_clearance
     poses: Poses
 
@@ -110,7 +110,7 @@ class MovingObstacles:
         network: NetworkConfig,
         clearance: float | None = None,
     ) -> MovingObstacles | None:
-        """Returns the moving obstacles of scenes as network inputs, scene s at frames[s]; None if none moves."""
+        """Returns the moving obstacles of scenes as network inputs, scene s at frames[s]; None if all are at rest."""
         if not any(scenes):
             return None
         rows, cells = [row for layer in zip_longest(*scenes) for row in layer], None
@@ -224,7 +224,7 @@ def surface_velocity(
     """Returns the velocity V of the surface for each particle, t V_own + (1 - t) V_mean, [N, 3].
 
     t is the particle's contact, `touch_N`. V_own is its row of `surface_N3`, 0 at walls. V_mean is the mean of V_own,
-    weighted by t, over the particles in the same coarsest cells and in cells across their faces.
+    weighted by t, over the particles in the same coarsest cells and in their face neighbours.
     """
     level, weight_N8 = grid.levels[-1], grid.weight_N8
     sum_C4 = grid.coarsest_sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))

@@ -23,8 +23,8 @@ SLACK = 1.01
 class NeighbourList:
     """Holds directed edges between particles in the order of `order_N`, by receiver, with one from each to itself."""
 
-    order_N: torch.Tensor  # int64: the particle at each place of the sorted order
-    sender_E: torch.Tensor  # int64, places in the sorted order
+    order_N: torch.Tensor  # int64: the particle at each index of the sorted order
+    sender_E: torch.Tensor  # int64, indices in the sorted order
     receivers: Segments
 
 
@@ -37,7 +37,7 @@ def neighbour_list(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: flo
     key_N, order_N = torch.sort(key_N, stable=True)
     position_N3 = position_N3[order_N]
     first_NR, length_NR = _runs(key_N)
-    # One row a candidate pair: its receiver, and its place in the receiver's runs.
+    # One row per candidate pair: its receiver, and its index in the receiver's runs.
     runs = length_NR.shape[1]
     length_Q = length_NR.flatten()
     end_Q = length_Q.cumsum(0)
@@ -64,7 +64,7 @@ def _keys(position_N3: torch.Tensor, scene_N: torch.Tensor, size: float) -> torc
 
 
 def _runs(key_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns first place and length of the 25 runs of each particle, [N, 25]."""
+    """Returns first index and length of the 25 runs of each particle, [N, 25]."""
     side = torch.arange(-REACH, REACH + 1, device=key_N.device)
     column_R = (side[:, None] * AXIS_STRIDE[0] + side[None] * AXIS_STRIDE[1]).flatten()
     low_NR = key_N[:, None] + (column_R - REACH * AXIS_STRIDE[2])

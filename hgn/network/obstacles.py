@@ -1,7 +1,7 @@
 """Obstacles on the device: the normals of sparse cells, found by key.
 
 Paper sec. 3: n_o is the normal of the obstacle cell that contains the particle. Without such a cell it is zero. With
-`network.obstacle_distance` cells are those of hgn.scene.surface_field, and n_o is as long as the particle is near.
+`network.obstacle_distance` cells are those of hgn.scene.surface_field, and |n_o| is the nearness.
 Shape legend: K obstacle cells of all scenes, N particles, V values of a surface, its normal first.
 """
 

@@ -6,7 +6,7 @@ default parameters. If all are 0, they are not computed; the result is the same.
 | columns | value | only with |
 |---|---|---|
 | 2 | friction of the obstacle cell with the particle, and of the first one on its path | friction, obstacle_features |
-| 3 | for each axis: common friction of the two walls across it, times nearness of the nearer wall | friction |
+| 3 | for each axis: common friction of the two walls normal to it, times nearness of the nearer wall | friction |
 | 1 for each of INPUT_PARAMETERS | `scaled_parameters`, 0 for parameters of other materials | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 
@@ -116,10 +116,10 @@ def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: tor
 
 
 def wall_contact(wall_N6: torch.Tensor, local: bool) -> torch.Tensor:
-    """Returns from `relative.wall_nearness` how far walls can push particles, 0 to 1, [N, 6].
+    """Returns from `relative.wall_nearness` how much walls can push particles, 0 to 1, [N, 6].
 
     A network sees walls before they can push. With `local` inputs only walls that can push constrain a body, so a
-    ceiling does not stop bodies that slide down a slope below it. Otherwise walls push as soon as they are seen.
+    ceiling does not stop bodies that slide down a slope below it. Otherwise all visible walls can push.
     """
     first = FREE_NEARNESS if local else 0.0
     return ((wall_N6 - first) / (FULL_NEARNESS - first)).clamp(0, 1)

@@ -1,6 +1,6 @@
 """Obstacles whose pose may have gradients: normals are looked up in each obstacle's own frame and turned back.
 
-An obstacle's cells are computed once, at its place in the scene. A particle is expressed in that frame by
+An obstacle's cells are computed once, in the pose of the scene file. A particle is expressed in that frame by
 x' = R^T (x - t - c) + c with pivot c. The normal n found there becomes R n, so its direction follows the rotation
 exactly. The cell of a particle is piecewise constant, so n has no gradient with respect to shifts or the distance from
 the surface. With `smoothing` s the normal is the mean over a cube of s cells around the particle. The mean is
@@ -19,7 +19,7 @@ from hgn.network.obstacles import ObstacleCells
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The pose of an obstacle relative to its place in the scene: x -> R (x - c) + c + t."""
+    """The pose of an obstacle relative to that in the scene file: x -> R (x - c) + c + t."""
 
     rotation_33: torch.Tensor
     pivot_3: torch.Tensor  # c, domain units

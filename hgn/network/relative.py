@@ -14,7 +14,7 @@ cube. The columns are, in this order:
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
 G = sum_C w_pC t_C, with t_C = `touched` of `disturbance`, is at least the particle's own `surface_gate`. G is above 0
-if a surface is within reach of some particle in the same coarsest cells, or in cells across their faces, as in a pile.
+if a surface is within reach of some particle in the same coarsest cells, or in their face neighbours, as in a pile.
 
 The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
 them. These properties hold for any parameters:
@@ -39,7 +39,7 @@ from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_fric
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall within which the network sees it, in finest cells
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
-STEPS_AHEAD = 4  # number of places on the path of the next frame that are searched for an obstacle
+STEPS_AHEAD = 4  # number of positions on the path of the next frame that are searched for an obstacle
 QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units of s_a; rounding gives 1e-5 to 1e-4
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
@@ -146,7 +146,7 @@ def obstacle_surfaces(
 ) -> torch.Tensor:
     """Returns `ObstacleCells.surfaces` at the particle, and those first met on its path to the next frame, [N, 6 or 8].
 
-    STEPS_AHEAD evenly spaced places of the path are tested. Without an obstacle a normal is 0.
+    STEPS_AHEAD evenly spaced positions on the path are tested. Without an obstacle a normal is 0.
     """
     if obstacles is None:
         return torch.zeros_like(position_N3).repeat(1, 2)
@@ -175,8 +175,8 @@ def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distance
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, local: bool) -> torch.Tensor:
     """Returns the sum of n n^T of the surfaces that can push a particle, [N, 3, 3].
 
-    n n^T of a wall is multiplied by its `wall_contact`. The obstacle's normal at the particle counts; if it
-    is 0, the one ahead counts. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
+    n n^T of a wall is multiplied by its `wall_contact`. The obstacle's normal at the particle is used; if it
+    is 0, the one ahead. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
     """
     near_N6 = wall_contact(wall_N6, local)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
@@ -219,8 +219,8 @@ def disturbance(
     """Returns `disturbed` and `touched` of each coarsest cell, [C] each, from 0 to 1.
 
     `disturbed` is 0 if all particles around fly freely with one velocity. A particle is disturbed by a
-    surface within reach (`surface_gate`), or if a column of history or surroundings is not small against QUIET. A
-    coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces. These cells
+    surface within reach (`surface_gate`), or if a column of history or surroundings is not small compared with QUIET. A
+    coarsest cell is as disturbed as the most disturbed particle in it and in its face neighbours. These cells
     count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
