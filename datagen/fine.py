@@ -1,7 +1,7 @@
 """Simulates the scenes of a data set on a finer grid than the networks see, with more particles.
 
 Each visible particle of a scene is represented by the same number of fine particles, its children. The first child
-starts at the place of the visible particle. The others start around it, and their mean is at this place. So all fine
+starts at the position of the visible particle. The others start around it, and their mean is there. So all fine
 particles have the same mass, and a scene's first frame, total mass, momentum and centre of mass do not depend on the
 grid. An episode contains the first child of each visible particle. It does not contain the children's mean, because
 this is no point of the material once they separate (results/solver/README.md).
@@ -48,8 +48,8 @@ def wall_thickness(config: MpmConfig, cell_size: float) -> float:
 def solver_on_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
     """Returns the solver's settings for another cell size.
 
-    On a finer grid near walls end at the same place, and far walls less than a cell further out. On a coarser grid near
-    walls end less than one of its cells from that place.
+    On a finer grid near walls end at the same position, and far walls less than a cell further out. On a coarser grid
+    near walls end less than one of its cells from that position.
     """
     ratio = own_cell_size / cell_size
     return dataclasses.replace(config, wall_cells=max(2, 1 + int((config.wall_cells - 1) * ratio + 1e-6)))

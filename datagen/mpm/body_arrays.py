@@ -1,7 +1,7 @@
 """Arrays of a launch's moving obstacles for kernels (datagen.mpm.body_kernel).
 
 `contact` contains, in this order: the first of each scene's second fields, or -1 without moving sheets
-(SHAPE.second_fields); the place of each scene's first head, and the end of the heads (SHAPE.bodies); the heads
+(SHAPE.second_fields); the index of each scene's first head, and the end of the heads (SHAPE.bodies); the heads
 (layout.BodyHead); for each obstacle a table of its lists by base node (-1: none), and the lists (see LIST_HEAD).
 """
 

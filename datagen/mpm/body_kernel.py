@@ -1,6 +1,6 @@
 """Moving obstacles in Taichi kernels: their poses, and their surfaces near a node or a particle.
 
-A kernel transforms a place into the frame of each moving obstacle of its scene. See datagen.mpm.body. Lengths are in
+A kernel transforms a point into the frame of each moving obstacle of its scene. See datagen.mpm.body. Lengths are in
 cells, times in seconds.
 """
 
@@ -29,13 +29,13 @@ def _write(at: ti.i32, value, arrays: ti.template()):
 
 @ti.func
 def first_body(scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns the place in `contact` of a scene's first body; the next ones follow up to the next scene's."""
+    """Returns the index in `contact` of a scene's first body; the others follow, up to the next scene's."""
     return arrays.contact[arrays.shape[SHAPE.bodies] + scene]
 
 
 @ti.func
 def into_frame(place, pose: ti.i32, state: ti.i32, arrays: ti.template()):
-    """Returns a place in the frame of a body. `pose` is the start of the pose in `arrays.pose`."""
+    """Returns a point in the frame of a body. `pose` is the start of the pose in `arrays.pose`."""
     offset = place - _vector(pose, arrays)
     return _vector(state + STATE.origin, arrays) + ti.Vector(
         [offset.dot(_vector(pose + AXES + 3 * axis, arrays)) for axis in range(3)]
@@ -54,14 +54,14 @@ def out_of_frame(direction, pose: ti.i32, arrays: ti.template()):
 
 @ti.func
 def body_velocity(place, pose: ti.i32, state: ti.i32, arrays: ti.template()):
-    """Returns the velocity of a body at a place in this interval, cells a second."""
+    """Returns the velocity of a body at a point in this interval, cells per second."""
     turn = _vector(state + STATE.turn, arrays)
     return _vector(state + STATE.velocity, arrays) + turn.cross(place - _vector(pose, arrays))
 
 
 @ti.func
 def body_list(place, head: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns the index in `contact` of the list of triangles near a place in a body's frame, or -1."""
+    """Returns the index in `contact` of the list of triangles near a point in a body's frame, or -1."""
     base = ti.floor(place - 0.5, ti.i32)
     list_at = -1
     inside = 1
@@ -146,7 +146,7 @@ def move_bodies(scene: ti.i32, arrays: ti.template()):
 
 @ti.func
 def _sampled(place, vector: ti.template(), head: ti.i32, arrays: ti.template()):
-    """Returns one of the vectors of a body's samples, interpolated at a place in units of their spacing."""
+    """Returns one of the vectors of a body's samples, interpolated at a point in units of their spacing."""
     base = ti.floor(place, ti.i32)
     fraction = place - ti.cast(base, ti.f32)
     size_y, size_z = arrays.contact[head + HEAD.shape + 1], arrays.contact[head + HEAD.shape + 2]
@@ -181,7 +181,7 @@ def nearest_surface(
 
     `index` are the node's numbers along the axes. The arguments are those of the nearest surface at rest, and its
     `distance`. Results: the free direction, friction, smallest mass with which the node stops motion, and the surface's
-    velocity in domain units a second.
+    velocity in domain units per second.
     """
     place = ti.cast(index, ti.f32)
     normal, friction, least = normal_at_rest, friction_at_rest, least_at_rest

@@ -41,7 +41,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     process starts fast.
 
     Raises: ConfigError if cuda is requested without a GPU, or if the process already uses another device or number of
-    threads (Taichi has one runtime a process).
+    threads (Taichi has one runtime per process).
     """
     global _started
     require(device in ("auto", "cpu", "cuda"), "device", "one of auto, cpu, cuda", device)

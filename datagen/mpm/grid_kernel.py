@@ -195,10 +195,10 @@ def substep(
              these nodes are at the end of node and gain
     block    flags and list of touched blocks (see mark), the list's length, 1 if an interval begins in any scene and
              the list is built again, and the marks of own_step
-    contact  entry of each node or -1: the place of its vectors in `contact_normal` (see surface_kernel.NODE_VECTORS),
-             and if below SHAPE.ghosts the place of its second field after SHAPE.ghost_begin. Then for each base node
+    contact  entry of each node or -1: the index of its vectors in `contact_normal` (see surface_kernel.NODE_VECTORS),
+             and if below SHAPE.ghosts the index of its second field after SHAPE.ghost_begin. Then for each base node
              the start of its list of triangles in `contact`, or -1; then these lists with their heads (see
-             surface_kernel.LIST_HEAD), which contain places of triangles' vectors in `contact_normal`. Then the
+             surface_kernel.LIST_HEAD), which contain indices of triangles' vectors in `contact_normal`. Then the
              moving obstacles (see body_arrays)
     pose     numbers of moving obstacles (see layout.BodyState)
     """

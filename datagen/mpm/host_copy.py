@@ -2,7 +2,7 @@
 
 Taichi's to_numpy allocates new memory each time. It copies this memory to the GPU as it is, and then the result back,
 while the GPU is idle. Here only the result is copied, into memory that is reused. If the system allows it, the memory
-is locked in its place, so that a GPU writes to it at the speed of its bus.
+is page-locked, so that a GPU writes to it at the speed of its bus.
 """
 
 import ctypes

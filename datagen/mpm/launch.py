@@ -285,7 +285,7 @@ class Launch(ABC):
         return setting
 
     def _contacts(self, vector: np.ndarray, cell_masses: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the places and entries of contact nodes (see grid_kernel.substep). Writes the entries' vectors."""
+        """Returns the indices and entries of contact nodes (see grid_kernel.substep). Writes the entries' vectors."""
         # scene after scene, so that arrays stay in a core's cache; nodes with two fields get the first entries
         places, entries = np.empty(len(vector), np.int32), np.empty(len(vector), np.int32)
         filled, doubled, single = 0, 0, self.ghosts
@@ -320,7 +320,7 @@ class Launch(ABC):
         return place * np.int32(BLOCK_NODES) + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
 
     def _sweeps(self, first_vector: int, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns places and values of the contact array for the swept test (see grid_kernel.substep), and its length.
+        """Returns indices and values of the contact array for the swept test (see grid_kernel.substep), and its length.
         Writes the triangles' vectors."""
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]

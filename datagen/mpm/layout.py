@@ -77,8 +77,8 @@ class SceneValue(NamedTuple):
     begins: int = 12  # 1 if the present substep is the first of its interval, else 0
     stability_fraction: int = 13  # longest step of stress as a fraction of the stability limit
     gravity_time: int = 14  # time of gravity in the present substep, s: see mls_mpm
-    water_density: int = 15  # number of particles a cell at rest; 0 if unknown
-    wall_friction: int = 16  # 16, 17, 18: friction of the domain's walls across x, y, z
+    water_density: int = 15  # number of particles per cell at rest; 0 if unknown
+    wall_friction: int = 16  # 16, 17, 18: friction of the domain's walls normal to x, y, z
     frame_end: int = 19  # time of the end of the present frame, s
     stiffness: int = 20  # largest stiffness in the step before, m²/s²
     last_interval: int = 21  # length of the interval before, s
@@ -89,7 +89,7 @@ class SceneValue(NamedTuple):
     nodes: int = 26  # 26, 27, 28: numbers of nodes along the axes
     high: int = 29  # 29, 30, 31: largest coordinates of a particle
     size: int = 32  # 32, 33, 34: size of the domain
-    obstacle_speed: int = 35  # largest speed of obstacles, domain units a second
+    obstacle_speed: int = 35  # largest speed of obstacles, domain units per second
     length: int = 36
 
 
@@ -107,7 +107,7 @@ class Setting(NamedTuple):
     cell_size: int = 0
     inverse_cell_size: int = 1
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
-    fixed_substeps: int = 3  # number of substeps a frame, with a fixed time step
+    fixed_substeps: int = 3  # number of substeps per frame, with a fixed time step
     density_relaxation: int = 4  # rate of relaxation of water's J to its density, 1/s
     low: int = 5  # smallest coordinate of a particle on each axis
     transfer_interval: int = 6  # s; 0 if every substep is a transfer
@@ -125,7 +125,7 @@ class Shape(NamedTuple):
     maximum_substeps: int = 6
     ghosts: int = 7  # nodes of all scenes that sheets hide from particles near them: see collider
     ghost_begin: int = 8  # first of their second fields in the array of nodes
-    bodies: int = 9  # places in `contact` of the moving obstacles: see body_arrays
+    bodies: int = 9  # indices in `contact` of the moving obstacles: see body_arrays
     second_fields: int = 10
     part_begin: int = 11  # first of the following: first particle of each (scene, part), and the end
 
@@ -156,9 +156,9 @@ class BodyHead(NamedTuple):
     closed: int = 0
     state: int = 1  # start of its numbers in the array `pose`: see BodyState
     keys: int = 2  # number of keyframes
-    samples: int = 3  # place of the first sample in `contact_normal`
+    samples: int = 3  # index of the first sample in `contact_normal`
     shape: int = 4  # 4, 5, 6: number of samples along the axes
-    lists: int = 7  # place in `contact` of the table of lists of triangles
+    lists: int = 7  # index in `contact` of the table of lists of triangles
     cells: int = 8  # 8, 9, 10: shape of this table
     length: int = 11
 
@@ -166,7 +166,7 @@ class BodyHead(NamedTuple):
 class BodyState(NamedTuple):
     """Positions in the float32 numbers of a moving obstacle. Lengths are in cells."""
 
-    begin: int = 0  # pose when the present interval began: place of the pivot, then the axes of the frame
+    begin: int = 0  # pose when the present interval began: position of the pivot, then the axes of the frame
     end: int = 12  # pose after the present substep
     turn: int = 24  # 24, 25, 26: angular velocity in the present interval, rad/s
     velocity: int = 27  # 27, 28, 29: of the pivot
@@ -186,7 +186,7 @@ class Key(NamedTuple):
     axes: int = 4
     turn: int = 13
     velocity: int = 16
-    speed: int = 19  # largest speed of the obstacle's points, domain units a second
+    speed: int = 19  # largest speed of the obstacle's points, domain units per second
     length: int = 20
 
 
@@ -216,7 +216,7 @@ class Live(NamedTuple):
     """Positions in the int32 state of a scene, which its team shares."""
 
     blocks: int = 0  # number of touched blocks in this interval
-    cursor: int = 1  # number of particles with a place in the order
+    cursor: int = 1  # number of particles that are already in the order
     copy: int = 2  # which of the two copies of the particles is valid
     frames: int = 3  # number of completed frames
     length: int = 4

@@ -15,7 +15,7 @@ interval is synchronised, its first substep compensates both (VALUE.catch_up). I
 follows a synchronised one, its first substep skips strain, and the stress of this substep acts for half of it.
 
 In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the other substeps they
-keep their places on the grid, compute strain and stress from the gradient of the nodes' velocities, and transfer only
+stay in place on the grid, compute strain and stress from the gradient of the nodes' velocities, and transfer only
 force, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last substep particles take
 velocity and gradient from the grid, and move by the interval times the velocity. Momentum and angular momentum are
 conserved, because stresses are symmetric and each particle moves along its velocity. multiple_time_stepping chooses the
@@ -57,8 +57,8 @@ def respond(
 ):
     """Computes a material's response to a step of `step` seconds with the velocity gradient C, 1/s.
 
-    Particles keep the places that they had when the interval began, so C is the gradient by those places. `stretch` is
-    the sum of dt (C + Cᵀ) / 2 in the interval so far. The gradient by the present places is, to first order,
+    Particles keep the positions that they had when the interval began, so C is the gradient at these. `stretch` is
+    the sum of dt (C + Cᵀ) / 2 in the interval so far. The gradient at the present positions is, to first order,
     C - ((C + Cᵀ) / 2) @ stretch. With this gradient the steps of an interval together stretch F as one step would.
 
     Returns the response, -(V0 4 / dx²) stress / mass: the rate at which stress changes APIC's C; the new stretch and F
@@ -115,9 +115,9 @@ def node_velocity(
     """Returns the new velocity of a node's field: `before` + `momentum` / `mass` + `fall` after colliders and walls.
 
     `momentum` is the sum of contributions, and `fall` the change by gravity. The result is 0 for a mass that is only
-    rounding of the weights. The node has number `local` in a block whose place along x, y, z is `corner`, in ten bits
-    each. `facing` is twice the node's entry in `contact_normal`, plus 1 for its second field; the entry is -1 without
-    an obstacle at rest.
+    rounding of the weights. The node has number `local` in a block whose coordinates along x, y, z are `corner`, in ten
+    bits each. `facing` is twice the node's entry in `contact_normal`, plus 1 for its second field; the entry is -1
+    without an obstacle at rest.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:

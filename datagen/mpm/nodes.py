@@ -1,4 +1,4 @@
-"""Nodes of the grid for Taichi kernels: their places in arrays, and quadratic B-splines between them and particles.
+"""Nodes of the grid for Taichi kernels: their indices in arrays, and quadratic B-splines between them and particles.
 
 A particle at x reaches the nodes base .. base + 2 with base = floor(x / dx - 1/2). Node I lies at I dx. Nodes are
 stored by blocks of 4 x 4 x 4, [scene, block, node in block].

@@ -27,10 +27,10 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
 # Number of thread blocks that run on a processor concurrently. Taichi compiles kernels for two blocks of any size: a
-# thread has 64 registers with 512 threads a block, 128 with 256, and 255 with 128.
+# thread has 64 registers with 512 threads per block, 128 with 256, and 255 with 128.
 GPU_BLOCKS = 2
 TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # for many scenes, which teams compute in turn
-EVEN = 0.95  # one block a scene above this fraction of filled turns and this mean / largest particle count
+EVEN = 0.95  # one block per scene above this fraction of filled turns and this mean / largest particle count
 SHARED_THREADS = 128  # threads of a block of a few scenes
 SHARED_PARTICLES = 8  # fewest particles of such a block
 LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
@@ -81,9 +81,9 @@ def simulate(
     On a CPU a scene's result does not depend on its batch, bitwise. `cpu_threads` changes it only through the number of
     partial sums, min(cpu_threads, 4). On a GPU sums have no fixed order.
 
-    A particle with an entry time is NaN before it; it enters in free flight from its given place. A scene that is not
-    finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame.
-    The result of a scene without particles has shape [frames, 0, 3].
+    A particle with an entry time is NaN before it; it then enters in free flight from its given position. A scene that
+    is not finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS per frame ends as a SceneFailure with cause and
+    frame. The result of a scene without particles has shape [frames, 0, 3].
 
     Raises: ConfigError for scenes that do not share a grid, particles outside the walls, obstacles that are not finite,
     fewer than one frame, or a missing device.
@@ -218,7 +218,7 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
     room = _blocks_at_once(device)
     blocks = min(room // scenes, -(-most // SHARED_PARTICLES))
     if blocks >= SHARED_BLOCKS:
-        # with at most one particle a thread, sums over runs of particles do not pay
+        # with at most one particle per thread, sums over runs of particles are not faster
         return Team(SHARED_THREADS, blocks, 1) if most <= SHARED_THREADS * blocks else Team(SHARED_THREADS, blocks)
     rounds = -(-scenes // room)
     if scenes > EVEN * rounds * room and sum(counts) > EVEN * scenes * most:

@@ -131,7 +131,7 @@ def _first_moving(start, end, fraction_at_rest: ti.f32, scene: ti.i32, arrays: t
     """Returns the first triangle of a moving obstacle that the path meets before the given fraction.
 
     The path is that in the obstacle's frame, from its pose at the start of the interval to that at the end. Results:
-    those of _first_crossing; the velocity of the surface, in cells a second; and the start moved with the obstacle.
+    those of _first_crossing; the velocity of the surface, in cells per second; and the start moved with the obstacle.
     """
     first = fraction_at_rest
     stop = end

@@ -8,7 +8,7 @@ has several, all blocks of a launch must run concurrently. A team computes one s
 One thread for each particle computes strain, stress and contact with triangles. Each frame sorts the particles by
 their cells into the other copy of the state. Neighbours in space are then neighbours in memory.
 
-With one thread a block the kernel also runs on a CPU, where tests compare it with the other kernel.
+With one thread per block the kernel also runs on a CPU, where tests compare it with the other kernel.
 """
 
 from collections import namedtuple

@@ -32,7 +32,7 @@ PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU, 
 class Team(NamedTuple):
     """The thread blocks that compute a scene. They wait for each other, so all must run concurrently."""
 
-    threads: int  # threads a block: a multiple of 32 on a GPU, 1 on a CPU; 0: no team, one launch a substep
+    threads: int  # threads per block: a multiple of 32 on a GPU, 1 on a CPU; 0: no team, one launch per substep
     blocks: int = 1
     run: int = 8  # number of particles that a thread sums, in the order of their cells, before it adds to nodes
 

@@ -6,7 +6,7 @@ would wait, so threads process lists. If a thread has at most one particle (`run
 
 A block lists its own particles, counted from the scene's first. `column_list` has particles that begin a step and,
 backwards from its end, particles that continue a step whose stress acts evenly. `giving` has both in order, with -1 - p
-for a continuing particle p. Lists lie at the places of the block's own particles (see team_particles.dealt). Their
+for a continuing particle p. Lists have the indices of the block's own particles (see team_particles.dealt). Their
 lengths are columns[segment + ACTING], columns[segment + GOING_ON] and columns[segment + GIVING].
 """
 

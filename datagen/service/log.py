@@ -21,7 +21,7 @@ _LEFT_OUT = b"\n(lines are missing here: nobody read the log)\n"
 
 
 class UnhurriedLog:
-    """While it is entered, output of this process and its children to `files` goes to the same places if possible.
+    """While it is entered, output of this process and its children to `files` still reaches them if possible.
 
     It is a context manager. A terminal is written directly, because its user may stop the output."""
 

@@ -1,6 +1,6 @@
 """Serves a data set over HTTP, read-only: the manifest, the listed shards, and the progress of the generator.
 
-| path | what | |
+| path | contents | |
 |---|---|---|
 | /manifest.json | the manifest: contents of the data set, and the published part | ETag: sha256 of its bytes |
 | /index/... | the index's files (see `hgn.data.index`) | Range |
@@ -60,7 +60,7 @@ class Snapshot:
 
 
 class Published:
-    """The manifest of a folder, and the places of its shards.
+    """The manifest of a folder, and the index of its shards.
 
     A changed manifest and each needed line of the index are read once, however many requests arrive. A snapshot never
     changes, so a request sees one manifest.
