@@ -108,9 +108,9 @@ class SceneConfig:
     # fraction of each kind of hgn.scene.world, as in conf/scene/world.yaml; kinds draw all settings but domain_size
     # (the largest), cell_size, materials and particles_per_cell; empty: scenes follow the settings above
     kinds: dict[str, float] = field(default_factory=dict)
-    # friction: a third of the scenes has none, others draw it for each obstacle, the floor and the walls; parameters:
-    # half of the scenes has the solver's, others draw those of hgn.scene.material for each group; moving: a third of
-    # the scenes with kinds has a moving obstacle; elastic: a sixth of the scenes has elastic bodies
+    # friction: a third of the scenes draws it for each obstacle, the floor and the walls; parameters: a third draws
+    # those of hgn.scene.material for each group; moving: a sixth of the scenes with kinds has a moving obstacle;
+    # elastic: a sixth has elastic bodies
     own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:
@@ -167,7 +167,7 @@ class MpmConfig(Bounded):
     # Adaptive steps as a fraction of a single particle's stability limit dx sqrt(rho / (3 lambda + 2 mu)).
     stability_fraction: AtMostOne[Positive[float]] = 0.875
     # Number of grid nodes at each face of the domain that stop outgoing motion. A grid with other cells needs another
-    # number for walls at the same place.
+    # number for walls at the same position.
     wall_cells: Annotated[int, Bound("at least 2, the reach of a particle", lambda count: count >= 2)] = 3
     device: DeviceName = "auto"  # cpu, cuda, or auto: cuda if there is a GPU
     scenes_per_launch: OneOrMore | None = None  # number of scenes in a launch; null: 1 on a CPU, up to 416 on a GPU

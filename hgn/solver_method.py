@@ -27,7 +27,7 @@ class SolverMethod(NamedTuple):
     # smooth velocities less.
     transfer_speed_m_s: float | None
     # Distance in cells from a closed body thinner than a cell. Nodes outside the body within it stop motion. At least
-    # one cell is used. A larger distance keeps material farther off.
+    # one cell is used. A larger distance keeps material farther away.
     collider_band_cells: float
 
 
