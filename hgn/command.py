@@ -43,7 +43,7 @@ _MACHINE_ERRORS = {
     errno.ECONNABORTED: "free memory if the system ended them,",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.ENFILE: "close other programs",
-    errno.ENOMEM: "close other programs, take smaller input or another machine",
+    errno.ENOMEM: "close other programs, use smaller input or another machine",
     errno.ECHILD: "free some memory, or check the device,",
 }
 
@@ -56,7 +56,7 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
 
     `main` may be the name of the module that contains it, which is then loaded after the configuration. The file of a
-    command without config groups lies in `conf/command/`. Elsewhere Hydra would take the command's keys
+    command without config groups is in `conf/command/`. Elsewhere Hydra would take the command's keys
     (`scene=my_scene.yaml`) for choices of a group.
 
     Hydra's options (--cfg, --config-path, --config-name, --multirun) work. --help prints keys, values and comments.
@@ -133,7 +133,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
     except (MemoryError, RuntimeError, ImportError) as error:
         if not memory_is_full(error):
             raise
-        code = _fail(f"memory is full ({error}); take smaller input or another machine", EXIT_MACHINE)
+        code = _fail(f"memory is full ({error}); use smaller input or another machine", EXIT_MACHINE)
     except KeyboardInterrupt as interruption:  # by Ctrl-C, or with the number of another signal
         code = _fail("interrupted", 128 + interruption.args[0] if interruption.args else EXIT_INTERRUPTED)
     return code

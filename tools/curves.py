@@ -77,7 +77,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 def read_run(folder: Path) -> Run:
     """Reads metrics.jsonl and the resolved configuration. Raises: ConfigError if the folder is no run of hgn.train."""
-    with damage_named(f"{folder}: runs must be folders of python -m hgn.train", "take another folder"):
+    with damage_named(f"{folder}: runs must be folders of python -m hgn.train", "use another folder"):
         for file in (folder / "metrics.jsonl", folder / "config.yaml"):
             if not file.is_file():  # opening a pipe would wait for ever
                 raise OSError(f"no plain file {file}")

@@ -109,7 +109,7 @@ def pages(specification: Path) -> list[Page]:
         def filled(match: re.Match[str], kind: str) -> str:
             name = match["name"]
             if name not in kinds[kind]:
-                remedy = "define it there or take the marker away"
+                remedy = "define it there or remove the marker"
                 raise ConfigError(f"{path}: {specification} has no {kind} {name}; {remedy}")
             used.add(name)
             read.clear()

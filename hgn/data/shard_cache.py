@@ -216,7 +216,7 @@ def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> No
             raise
         raise ConfigError(
             f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {folder} "
-            f"({error.strerror}); take one on a local disk"
+            f"({error.strerror}); use one on a local disk"
         ) from None
 
 

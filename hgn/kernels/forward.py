@@ -25,7 +25,7 @@ from hgn.schema import require
 PRECISIONS = ("fp32", "tf32", "fp16")
 CLEAR_ROWS = 64
 ADDRESSED = 2**31  # limit of int32 indices; larger edge tensors use 64-bit indices
-REMEDY = "take fewer at once, or backend torch"
+REMEDY = "use fewer together, or backend torch"
 NONE = -1  # bias offset of a product without a bias
 
 

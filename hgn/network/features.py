@@ -120,6 +120,6 @@ def material_rows(material_N: np.ndarray, materials: Sequence[str], names: Seque
         unknown = names[int(material_N[rows_N < 0][0])]
         raise ConfigError(
             f"material must be one of the network's ({', '.join(materials)}), got {unknown}; "
-            "take weights that were trained with it, for example own_physics"
+            "use weights that were trained with it, for example own_physics"
         )
     return torch.from_numpy(rows_N)

@@ -131,7 +131,7 @@ def animation_rate(rollout: Rollout, path: str | Path, every: int) -> float:
     require(every >= 1, "every", "at least 1", every)
     rate = rollout.frame_rate_hz / every
     if not 0 < rate <= fastest:
-        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}"
+        remedy = f"use every >= {math.ceil(rollout.frame_rate_hz / fastest)}"
         raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers support, got {rate:g}; {remedy}")
     return rate
 

@@ -176,7 +176,7 @@ def _started(
         "gravity_3",
         "left out for a network with absolute inputs, which supports only the gravity of its data",
         "a tensor",
-        remedy="take weights with relative inputs, such as mechanics",
+        remedy="use weights with relative inputs, such as mechanics",
     )
     count = len(scene.position_N3)
     position_N3 = given("position_N3", inputs.position_N3, scene.position_N3, (count, 3))

@@ -9,7 +9,7 @@ class DivergedError(RuntimeError):
     """Particles are not finite, or farther from the domain than its own size."""
 
     def __init__(self, frame: int, cause: str) -> None:
-        super().__init__(f"the simulation diverged at frame {frame}: {cause}; train further, or take other weights")
+        super().__init__(f"the simulation diverged at frame {frame}: {cause}; train further, or use other weights")
         self.frame, self.cause = frame, cause
 
 

@@ -184,7 +184,7 @@ class LiveSimulation:
         """Returns the start of scenes without their obstacles, which often do not change and are slow to prepare."""
         bare = []
         for scene in scenes:
-            remedy = "take Simulator.frames, or add_particles"
+            remedy = "use Simulator.frames, or add_particles"
             require(scene.emitting is None, "emitters", "left out here", "some", remedy=remedy)
             grid = scene.obstacle_grid
             no_cells = replace(grid, cell_K3=grid.cell_K3[:0], normal_K3=grid.normal_K3[:0])

@@ -370,10 +370,10 @@ class Simulator:
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
         rule = f"the network's {dimensions}"
-        remedy = f"take weights of {scene.dimensions}D data, or an episode of {dimensions}D data"
+        remedy = f"use weights of {scene.dimensions}D data, or an episode of {dimensions}D data"
         require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy=remedy)
         known = "moving" in self.network.config.own_physics
-        remedy = "take weights=own_physics, leave keyframes out, or run datagen.solve"
+        remedy = "use weights=own_physics, leave keyframes out, or run datagen.solve"
         rule = "at rest for a network without `moving` in network.own_physics"
         require(known or not scene.moving, "obstacles", rule, "keyframes", remedy=remedy)
         if info is None:
@@ -383,7 +383,7 @@ class Simulator:
             require(math.hypot(*scene.gravity) <= LARGEST_GRAVITY, "gravity", rule, scene.gravity)
         else:
             rule = f"the weights' {info.gravity}, because a network with absolute inputs has no gravity as input"
-            remedy = "take weights with relative inputs, such as mechanics, or train on scenes with this gravity"
+            remedy = "use weights with relative inputs, such as mechanics, or train on scenes with this gravity"
             same = math.dist(scene.gravity, info.gravity) <= SAME_GRAVITY * math.hypot(*info.gravity)
             require(same, "gravity", rule, scene.gravity, remedy=remedy)
         if info.network.obstacle_features:

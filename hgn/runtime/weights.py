@@ -83,7 +83,7 @@ def require_finite(tensors: Mapping[str, torch.Tensor], field: str, path: Path |
     # a sum takes a tenth of the time of isfinite; the sum of large numbers may be infinite too
     if bool(torch.stack([tensor.sum(dtype=torch.float32) for tensor in tensors.values()]).isfinite().all()):
         return
-    remedy = f"{path} is damaged or of a training that diverged; take another" if path else ""
+    remedy = f"{path} is damaged or of a training that diverged; use another" if path else ""
     for name, tensor in tensors.items():
         wrong = tensor[~tensor.isfinite()][:1].tolist()
         precision = "fp16" if tensor.dtype == torch.float16 else "fp32"
@@ -111,7 +111,7 @@ def find_weights(name: str, field: str = "weights") -> Path:
         return path
     names, remedy = ", ".join(shipped) or "none in this copy", near_name(name, shipped)
     if name in {path.stem for path in (config_directory() / "experiment").glob("*.yaml")}:
-        remedy = f"take one of these, or train with python -m hgn.train +experiment={name}"
+        remedy = f"use one of these, or train with python -m hgn.train +experiment={name}"
     require(False, field, f"a file or the name of shipped weights ({names})", name, remedy=remedy)
     raise AssertionError
 
@@ -197,7 +197,7 @@ def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:
         "data frame_rate_hz",
         f"the weights' {info.frame_rate_hz}",
         frame_rate_hz,
-        remedy="take a data set or weights of the same frame rate",
+        remedy="use a data set or weights of the same frame rate",
     )
 
 

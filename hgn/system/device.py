@@ -22,7 +22,7 @@ def choose_device(name: str) -> torch.device:
     except RuntimeError:
         raise ConfigError(f"device must be auto, cpu or cuda[:index], got {name!r}") from None
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(f"device must exist, got {name!r} with {torch.cuda.device_count()} CUDA devices; take cpu")
+        raise ConfigError(f"device must exist, got {name!r} with {torch.cuda.device_count()} CUDA devices; use cpu")
     return device
 
 

@@ -122,9 +122,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         last, remedy = path.parent / LAST_NAMES[0], near_file(path) or "hgn.train writes one"
         of_run = [file for name in (BEST_NAME, *LAST_NAMES) if (file := path / "checkpoints" / name).is_file()]
         if path.name == BEST_NAME and last.is_file():
-            remedy = f"no validation scene was measured, so take {last}"
+            remedy = f"no validation scene was measured, so use {last}"
         elif of_run:
-            remedy = f"take {of_run[0]}"
+            remedy = f"use {of_run[0]}"
         raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
     except Exception as error:  # torch raises any kind of error for damaged files
         reason = str(error).strip().split("\n")[0]
@@ -203,7 +203,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
-    remedy = "use that value, or take other training.init_weights"
+    remedy = "use that value, or other training.init_weights"
     theirs, ours = info.network, config.network
     same: dict[str, Any] = {}
     if theirs.relative and set(theirs.own_physics) <= set(ours.own_physics) and _begin(theirs, ours):

@@ -26,7 +26,7 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
         require(not asked, "dataset.folder", "a data set of python -m hgn.import_trajectories", folder, remedy=remedy)
         return mapping
     rule = f"one of python -m datagen without {FLAG}"
-    require(asked, "dataset.folder", rule, folder, remedy=f"it is imported; add {FLAG}, or take another folder")
+    require(asked, "dataset.folder", rule, folder, remedy=f"it is imported; add {FLAG}, or use another folder")
     assert manifest is not None
     network, training = mapping["network"], mapping["training"]
     with errors_in_config(folder):

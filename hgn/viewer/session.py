@@ -287,7 +287,7 @@ class PlaySession:
                 continue  # a part of it would be beyond a wall
             if not (np.abs(taken_A3 - centre) < 0.5 * size + self.cell_size).all(axis=1).any():
                 return triple(centre)
-        raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; take a smaller one")
+        raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; use a smaller one")
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
         """Replaces the obstacle of the same body, if it is still there. Raises ConfigError for a place far outside."""

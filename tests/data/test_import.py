@@ -364,7 +364,7 @@ def test_thick_walls_point_outwards():
 @pytest.mark.parametrize(
     ("experiment", "change", "message"),
     [
-        (False, {}, r"add \+experiment=imported, or take another folder"),
+        (False, {}, r"add \+experiment=imported, or use another folder"),
         (True, {"cell_size": 0.02}, r"network.cell_size must be the data's radius of 0.015, .* got 0.02; import it"),
         (True, {"dimensions": 3}, r"network.dimensions must be the data's 2, got 3"),
         (True, {"materials": ["water"]}, r"network.materials must be all of the data's \['water', 'goop'\]"),
@@ -427,7 +427,7 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     assert len(np.unique(result.position_TN3[..., 2])) == 1
     assert result.dimensions == 2 and compare_picture(result, [0, 8]).height == drawn.height
     for scene, message in (
-        ("funnel", "dimensions must be the network's 2, got 3; take weights of 3D data"),
+        ("funnel", "dimensions must be the network's 2, got 3; use weights of 3D data"),
         (None, "data must be given with weights of imported data, which differ from random scenes"),
     ):
         with pytest.raises(ConfigError, match=message):

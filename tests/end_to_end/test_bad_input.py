@@ -103,7 +103,7 @@ VALUES = [
     ("rollout", [*ROLLOUT, "weights=weight.safetensors"], "got weight.safetensors; did you mean weights.safetensors?"),
     ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
     ("export", ["checkpoint=.", "out=x"], "checkpoint must be an existing file, got .; hgn.train writes one"),
-    ("export", ["checkpoint=run", "out=x"], "checkpoint must be an existing file, got run; take run/checkpoints/"),
+    ("export", ["checkpoint=run", "out=x"], "checkpoint must be an existing file, got run; use run/checkpoints/"),
     ("export", ["checkpoint=run/checkpoints/bst.ckpt", "out=x"], "bst.ckpt; did you mean best.ckpt?"),
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
     ("export", ["out=x"], "checkpoint must be given, or weights instead, got None"),
@@ -175,7 +175,7 @@ MESH = of("edit_scene", "shape: cone, size: 0.3", "mesh: points.obj")
 STEPS = [*EVALUATE, "rollout_frames=0"]
 CUT_RUN, OF_RUN = of("damage_run", truncate), [OF_THE_RUN, EXPORT[1]]
 RATE, SNOW = of("weights", frame_rate_hz=30.0), of("weights", materials=("snow",))
-RATES = "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same"
+RATES = "data frame_rate_hz must be the weights' 30.0, got 60.0; use a data set or weights of the same"
 # command, arguments, fault, message
 FILES = [
     ("rollout", ROLLOUT, of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"), " inside obstacle_0_cone (particles: x 0.4"),

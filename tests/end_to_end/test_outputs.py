@@ -89,7 +89,7 @@ def test_pictures_refused_before_a_bar(place, capsys, monkeypatch):
     """An animation that viewers would not play is refused before its drawing begins."""
     assert exit_code(rollout.main, "rollout", [*ROLLOUT, "out=r.vtkhdf"], monkeypatch) == 0
     _, line = refused("render", ["rollout=r.vtkhdf", "out=r.gif", "every=1"], capsys, monkeypatch)
-    assert "take every >= 2" in line and "drawing" not in capsys.readouterr().err
+    assert "use every >= 2" in line and "drawing" not in capsys.readouterr().err
 
 
 def test_own_files_are_replaced(place, monkeypatch):

@@ -55,7 +55,7 @@ def test_names_and_paths(tmp_path, monkeypatch):
     for name, message in (
         ("sand", "'sand'"),
         ("obstacle_small", "'obstacle_small'; did you mean obstacles_small?"),
-        ("obstacles", "'obstacles'; take one of these, or train with python -m hgn.train +experiment=obstacles"),
+        ("obstacles", "'obstacles'; use one of these, or train with python -m hgn.train +experiment=obstacles"),
     ):
         with pytest.raises(ConfigError, match=f"^{re.escape(shipped + message)}$"):
             find_weights(name)

@@ -64,7 +64,7 @@ def test_blocks_are_alike(monkeypatch):
 def test_too_many_are_refused(scene, message, monkeypatch):
     """A scene with more cells or particles than int32 can address is refused before anything is computed."""
     monkeypatch.setattr(forward, "ADDRESSED", 16 * 24)
-    with pytest.raises(ConfigError, match=message + "; take fewer at once"):
+    with pytest.raises(ConfigError, match=message + "; use fewer together"):
         TritonStepper(bench_network(NETWORK, CPU), states()[scene], "fp32")
 
 

@@ -168,7 +168,7 @@ def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
         (lambda file: rewrite(file, lambda tensors, _: tensors.pop("embedding.weight")),
          "weights tensor embedding.weight must have shape"),
         *((stored("embedding.weight", value, kind),
-           rf"tensor embedding.weight must be finite in fp32, got {got}; .*weights.safetensors is .*; take another")
+           rf"tensor embedding.weight must be finite in fp32, got {got}; .*weights.safetensors is .*; use another")
           for value, kind, got in ((math.nan, torch.float32, "nan"), (math.inf, torch.float16, "inf"),
                                    (-math.inf, torch.bfloat16, "-inf"), (1e300, torch.float64, "inf"))),
         (stored("normaliser.velocity_std", math.nan), "tensor normaliser.velocity_std must be finite in fp32, got nan"),

@@ -320,7 +320,7 @@ def test_weights_that_do_not_fit(compare, tmp_path, monkeypatch):
     for name, message in (
         ("obstacle", r"weights\[0\] must be a file or the name of shipped weights \(.*obstacles.*\), got 'obstacle'"),
         (str(tmp_path / "none.safetensors"), r"weights\[0\] must be an existing file, got .*none"),
-        (str(tmp_path / "dry.safetensors"), r"weights\[0\] must fit the data, got .*dry.*: .*snow.*take other weights"),
+        (str(tmp_path / "dry.safetensors"), r"weights\[0\] must fit the data, got .*dry.*: .*snow.*use other weights"),
         (str(tmp_path / "slow.safetensors"), "frame_rate_hz must be the weights' 30.0, got 60"),
         (str(tmp_path / "moon.safetensors"), "gravity must be the weights'"),
     ):

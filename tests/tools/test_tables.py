@@ -90,7 +90,7 @@ FAULTS = [
     (("row.mse['10']:?", "row.mse['10']:"), "table frames: LookupError: no '10' among"),
     (("row.ms:.2g", "row.mse:.2g"), "table frames: TypeError"),
     (("row.check:?", "row.check:"), "table frames: ValueError: there is no value"),
-    (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
+    (("  chosen:", "  other:"), "has no table chosen; define it there or remove the marker"),
     (("bench.json", "none.json"), "FileNotFoundError: [Errno 2] No such file or directory: "),
     (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
     (("every(bench.rows, case='frame')", "every(bench.rows, case='no')"), "table frames: LookupError: no rows: every("),

@@ -236,7 +236,7 @@ def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, t
     assert f"no best.ckpt, because no validation scene was measured; export {last}" in said.out
     missing = run / "checkpoints" / "best.ckpt"
     assert last.is_file() and not missing.exists()
-    with pytest.raises(ConfigError, match=rf"got {missing}; no validation scene was measured, so take {last}"):
+    with pytest.raises(ConfigError, match=rf"got {missing}; no validation scene was measured, so use {last}"):
         export(missing, tmp_path / "out.safetensors")
     export(last, tmp_path / "out.safetensors")
     with pytest.raises(ConfigError, match=r"got .*other.ckpt; hgn.train writes one"):

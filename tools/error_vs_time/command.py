@@ -48,7 +48,7 @@ def main(mapping: dict[str, Any]) -> int:
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
-    remedy = "take python -m hgn.evaluate for imported sets"
+    remedy = "use python -m hgn.evaluate for imported sets"
     require("mpm" in store.manifest.config, "data", "a set of python -m datagen", config.data, remedy)
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
@@ -124,7 +124,7 @@ def named_weights(names: Sequence[str], episodes: Sequence[Episode]) -> list[Pat
         try:
             require_fits(file, episodes, f"weights[{i}]")
         except ConfigError as error:
-            remedy = "take other weights, or the data set that these were trained on"
+            remedy = "use other weights, or the data set that these were trained on"
             raise ConfigError(f"weights[{i}] must fit the data, got {name}: {error}; {remedy}") from None
     return files
 

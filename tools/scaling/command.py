@@ -38,7 +38,7 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
     if config.device == "cpu" or (config.device == "auto" and gpus == 0):
         return "cpu", config.devices or 2
     wanted = config.devices or max(gpus, 1)
-    require(wanted <= gpus, "devices", f"at most the {gpus} GPUs of this machine", wanted, "take device=cpu")
+    require(wanted <= gpus, "devices", f"at most the {gpus} GPUs of this machine", wanted, "use device=cpu")
     return "cuda", wanted
 
 
