@@ -1,4 +1,4 @@
-"""Runs all commands: Hydra composes the config, and errors that a user can mend end in one line.
+"""Runs all commands: Hydra composes the config, and errors that a user can fix end in one line.
 
 Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input (also a pipe or
 device in place of a file or folder), 130 Ctrl-C, 143 SIGTERM, 141 closed output pipe (as in `… | head`).
@@ -60,7 +60,7 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     (`scene=my_scene.yaml`) for choices of a group.
 
     Hydra's options (--cfg, --config-path, --config-name, --multirun) work. --help prints keys, values and comments.
-    `main` returns an exit code, or None for 0. Errors that a user can mend are printed as one line, `error: ...`.
+    `main` returns an exit code, or None for 0. Errors that a user can fix are printed as one line, `error: ...`.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # the process was started without this stream

@@ -42,10 +42,10 @@ class ParticleState:
     gravity_S3: torch.Tensor  # gravity of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
     barriers: Barriers | None = None  # triangles of obstacles; only with step.obstacle_clearance
-    wall_friction_S3: torch.Tensor | None = None  # friction of the walls across x, y, z; None: 0, or no input
-    parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: 0, or no inputs
-    rest: RestShape | None = None  # of elastic bodies; None: there are none, or no inputs
-    moving: MovingObstacles | None = None  # obstacles in motion; `obstacles` and `barriers` are those at rest
+    wall_friction_S3: torch.Tensor | None = None  # friction of the walls normal to x, y, z; None: 0, or no input
+    parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: 0, or no input
+    rest: RestShape | None = None  # rest shape of elastic bodies; None: no such bodies, or no input
+    moving: MovingObstacles | None = None  # moving obstacles; `obstacles` and `barriers` contain those at rest
 
     @property
     def scene_count(self) -> int:

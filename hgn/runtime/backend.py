@@ -4,7 +4,7 @@
 |---|---|---|---|
 | torch | PyTorch, the reference | all | yes |
 | triton | Triton kernels, frames and updates in CUDA graphs | hgn | in training updates |
-| cpu | compiled C, each core a block of rows | hgn | no |
+| cpu | compiled C; each core computes blocks of rows | hgn | no |
 
 All have the same interface. `choose` returns the fastest supported backend and reports why.
 """

@@ -36,7 +36,7 @@ from hgn.step.reference import Accelerations, advanced
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A change of an obstacle's place: a rotation about a pivot, then a translation. None means no change."""
+    """A change of an obstacle's pose: a rotation about a pivot, then a translation. None means no change."""
 
     rotation_3: torch.Tensor | None = None  # axis times angle, radians
     translation_3: torch.Tensor | None = None  # domain units

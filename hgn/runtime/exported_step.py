@@ -5,7 +5,7 @@ The numbers of particles, obstacle cells and triangles may change from frame to 
 raises no errors, so its caller checks that positions are finite. `input_names` and OUTPUTS name its tensors.
 `initial_arrays` returns the inputs of a scene.
 Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles, P parameters, R particles with a
-rest shape (0, or N), B neighbours at rest, V moving obstacles, T frames.
+rest shape (0, or N), B rest neighbours, V moving obstacles, T frames.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ class Step(nn.Module):
         the cell's centre last. `obstacle_triangle` [F, 3, 3] are corners. Networks with absolute inputs ignore gravity;
         networks without `obstacle_clearance` ignore triangles.
 
-        `own` are those of OWN_INPUTS that the network has: friction of the walls across x, y, z [3], and of obstacle
-        cells [K]; values of INPUT_PARAMETERS [N, P]; places at rest [R, 3], and neighbours at rest, int64 [R, B],
-        -1 for none; poses x -> R x + t of moving obstacles, R and then t, in this frame and the next [2, V, 3, 4],
+        `own` contains the inputs of OWN_INPUTS that the network has: friction of the walls normal to x, y, z [3], and
+        of obstacle cells [K]; values of INPUT_PARAMETERS [N, P]; rest positions [R, 3], and rest neighbours, int64 [R,
+        B], -1 for none; poses x -> R x + t of moving obstacles, R and then t, in this frame and the next [2, V, 3, 4],
         their cells, int64 [K, 4], the obstacle's number first, normals and friction of these [K, 4], with
         `obstacle_distance` [K, 5], and triangles [V, F, 3, 3].
         """
@@ -139,7 +139,7 @@ class Step(nn.Module):
     def _moving(
         self, pose_2V34: torch.Tensor, cell_K4: torch.Tensor, surface_KV: torch.Tensor, corner_VF33: torch.Tensor
     ) -> MovingObstacles:
-        """Returns the moving obstacles of the frame. All pivots are 0, so that the places are t."""
+        """Returns the moving obstacles of the frame. All pivots are 0, so that their positions are t."""
         rotation_2V33, place_2V3 = pose_2V34[..., :3], pose_2V34[..., 3]
         change_V33 = rotation_2V33[1] @ rotation_2V33[0].mT - torch.eye(3, device=pose_2V34.device)
         zero_V3, shift_V3 = torch.zeros_like(place_2V3[0]), place_2V3[1] - place_2V3[0]

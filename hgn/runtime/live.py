@@ -27,7 +27,7 @@ class LiveSimulation:
     """One scene or several, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
     A change between two frames affects scene `index` from the next frame on. Particles that it does not add, remove or
-    restore keep positions and velocity histories bitwise. Particles are sorted by scene, new ones last in theirs.
+    restore keep positions and velocity histories bitwise. Particles are sorted by scene, new ones last in each.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class LiveSimulation:
     def add_particles(
         self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray, index: int = 0
     ) -> np.ndarray:
-        """Adds particles with default parameters that come from free flight. `material_A` are indices into MATERIALS.
+        """Adds particles with default parameters and a history of free flight. `material_A` are indices into MATERIALS.
 
         Positions are in domain units, velocities in domain units per second. Returns the particles' velocity histories,
         float32 [A, M, 3] in domain units per frame, newest first. Raises: ConfigError for a material that the network

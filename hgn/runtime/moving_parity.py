@@ -64,7 +64,7 @@ def require_moving_parity(
 
 
 def _ways(moving: MovingObstacles, domain_S3: torch.Tensor, count: int, history: int) -> ParticleState:
-    """Returns particles whose next frames lead through triangles of the obstacles, in turn of each."""
+    """Returns particles whose paths in the next frame pass triangles of the obstacles, of one after the other."""
     rng, scenes = np.random.default_rng(0), len(moving.scenes)
     own = [(j * scenes + s, obstacle) for s, scene in enumerate(moving.scenes) for j, obstacle in enumerate(scene)]
     chosen = [own[i % len(own)] for i in range(count)]

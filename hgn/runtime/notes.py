@@ -14,7 +14,7 @@ SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; 
 
 
 def notes_on_scene(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[str]:
-    """Yields a line for each note on the files of a scene and on physics that the weights ignore or do not know."""
+    """Yields a line for each note on the files of a scene and on physics that the weights do not support."""
     yield from notes_on_files(scene)
     inputs = info.network.own_physics
     used = INPUT_PARAMETERS if "parameters" in inputs else ()

@@ -141,7 +141,7 @@ class Simulation:
             frame = self.entries[0].frame
             yield from self._blocks(frame - 1)
             entering = [entry.state for entry in self.entries if entry.frame == frame]
-            for block_TN3 in self._blocks(frame):  # in their first frame they are at their initial places
+            for block_TN3 in self._blocks(frame):  # in their first frame they have their initial positions
                 new = [state.position_N3.expand(len(block_TN3), -1, -1) for state in entering]
                 yield _finished(torch.cat([block_TN3, *new], dim=1))
             del self.entries[: len(entering)]

@@ -65,11 +65,11 @@ class InitialState:
     materials: tuple[str, ...] = MATERIALS
     past_HN3: np.ndarray | None = None  # frames before frame 0, oldest first; None: free flight before frame 0
     dimensions: int = 3
-    emitting: Scene | None = None  # the scene, if particles enter later; they follow the others
+    emitting: Scene | None = None  # the scene, if particles enter later; these come after the others
     wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     parameters: np.ndarray | None = None  # float32 [N, P], hgn.scene.own_physics.input_parameters
     body_N: np.ndarray | None = None  # number of each particle's body; None: found from distances of elastic particles
-    moving: tuple[MovingObstacle, ...] = ()  # in motion; `obstacle_grid` and `corners` contain obstacles at rest
+    moving: tuple[MovingObstacle, ...] = ()  # moving obstacles; `obstacle_grid` and `corners` contain those at rest
 
     def __post_init__(self) -> None:
         require_particles(self.position_N3, self.velocity_N3, self.material_N, self.materials)
@@ -353,8 +353,8 @@ class Simulator:
         Arguments replace the scene's own values: positions and velocities [N, 3], gravity [3] (relative inputs only),
         the domain's size [3], and by name wall_friction [3] and parameters [N] that are inputs of the network. Units
         are domain units and seconds. `poses` rotates and shifts obstacles by number. `smoothing`, 0 to 1 obstacle
-        cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes all and keeps one frame's
-        intermediate results in memory. docs/how_to/gradients.md lists quantities with gradients.
+        cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes it with one frame's intermediate
+        results in memory. docs/how_to/gradients.md lists quantities with gradients.
         Raises: ConfigError and DivergedError as `rollout`.
         """
         require(isinstance(scene, Scene), "scene", "a Scene", type(scene).__name__)
@@ -392,7 +392,7 @@ class Simulator:
 
 
 def initial_states(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
-    """Returns the initial states of a list of scenes. Raises: ConfigError for another type, and for none."""
+    """Returns the initial states of a list of scenes. Raises: ConfigError for another type or no scene."""
     example = "as in rollout([scene], frames)"
     require(isinstance(scenes, Iterable), "scenes", "a list of scenes", type(scenes).__name__, remedy=example)
     states = [InitialState.of(scene) for scene in scenes]

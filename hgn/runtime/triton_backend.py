@@ -43,7 +43,7 @@ class TritonBackend(Backend):
             self.idle[state.scene_count] = stepper
 
     def _new_stepper(self, state: ParticleState, capacity: int) -> TritonStepper:
-        """Allocates a stepper and checks it. If it fails the check, precision `auto` becomes tf32 for good."""
+        """Allocates a stepper and checks it. If it fails the check, precision `auto` becomes tf32 permanently."""
         stepper = TritonStepper(self.network, state, self.precision, capacity=capacity, step=self.step)
         if len(state.position_N3) > CHECKED_PARTICLES:
             return stepper

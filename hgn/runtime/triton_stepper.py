@@ -83,7 +83,7 @@ def _own_physics(config: NetworkConfig, state: ParticleState) -> tuple[str, ...]
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """Launched frames: their number, the place of the first one, and `frame` and `status` after the last one."""
+    """Launched frames: their number, the index of the first one, and `frame` and `status` after the last one."""
 
     frames: int
     first: int

@@ -166,7 +166,7 @@ def network_with(
         claims.add(f"{field} tensor {name}", tensor.numel(), 4)
         require(tensor.is_floating_point(), f"{field} tensor {name}", "of floating point numbers", str(tensor.dtype))
         numbers += tensor.numel()
-    # message passing has two square matrices a step; a network is not much larger than these
+    # message passing has two square matrices per step; a network is not much larger than these
     count = 2 * config.message_passing_steps * (2 * config.levels - 1)
     rule = (
         f"at least {count} with {count * config.width**2} numbers for network.levels, message_passing_steps and width"

@@ -21,7 +21,7 @@ from hgn.system.files import write_atomically
 from hgn.system.patience import standard_patience_s
 from hgn.system.ranks import first_rank
 
-PROJECT = "hgn"  # of W&B, and experiment of MLflow, unless the environment names another
+PROJECT = "hgn"  # project in W&B and experiment in MLflow, unless the environment names another
 MOST_WAITING = 10_000  # calls that wait for a logger; later ones are dropped
 Builder = Callable[[Path, dict[str, Any]], Logger]
 

@@ -41,8 +41,8 @@ def require_update_parity(
     symmetries: Sequence[Symmetry] | None = None,
     frames: Sequence[int] = (),
 ) -> tuple[float, float]:
-    """Returns the relative errors of outputs and gradients on the batch of `updates`, which has images of `episodes`
-    in `frames`.
+    """Returns the relative errors of outputs and gradients on the batch of `updates`: `episodes` under `symmetries`, in
+    `frames`.
 
     The errors are NaN for a batch of more than CHECKED_PARTICLES. Raises: ParityError if an error exceeds its bound.
     """
@@ -81,7 +81,7 @@ def require_update_parity(
 def _gradients(
     network: HierarchicalGraphNetwork, output_N3: torch.Tensor, weight_N3: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Returns the gradients of the weighted sum of outputs by the network's parameters."""
+    """Returns the gradients of the weighted sum of outputs with respect to the parameters."""
     parameters = list(network.parameters())
     gradients = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
     return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, gradients, strict=True)]

@@ -88,7 +88,7 @@ def simulation_launches(
     """Makes the launches of a simulation's frame, first without moving obstacles. Returns the simulation."""
     config, own, device = network.config, network.config.own_physics, network.normaliser.acceleration_std.device
     with device:
-        # one particle a cell, so that no cell is crowded
+        # one particle per cell, so that no cell is crowded
         position_N3 = config.cell_size * torch.arange(particles)[:, None].expand(-1, 3)
         state = ParticleState(
             position_N3=position_N3,

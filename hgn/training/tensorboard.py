@@ -31,7 +31,7 @@ def write_pictures(folder: Path, update: int, rollout: Rollout, error_T: dict[st
     frames = np.linspace(0, rollout.frame_count - 1, PICTURES).astype(int).tolist()
     write_picture(paths["rollout/picture"], compare_picture(rollout, frames))
     write_picture(paths["rollout/error_over_time"], error_curve(error_T, rollout.frame_rate_hz))
-    # viewers play at most 50 pictures a second
+    # viewers play at most 50 pictures per second
     every = max(-(-rollout.frame_count // ANIMATION_PICTURES), -(-int(rollout.frame_rate_hz) // 50))
     animate(rollout, paths["rollout/animation"], every=every, size=ANIMATION_SIZE)
     return paths

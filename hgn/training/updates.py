@@ -36,7 +36,7 @@ class TrainedNetwork:
 class Updates(Protocol):
     """Trains on chunks of samples."""
 
-    precision: str  # of matrix products: fp32, tf32 or fp16
+    precision: str  # precision of matrix products: fp32, tf32 or fp16
     pool: PushforwardPool[Any, Any] | None  # None without pushforward
 
     def run(self, chunk: Any, first_update: int) -> None:
