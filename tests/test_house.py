@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_226,
+    "hgn": 34_239,
     "datagen": 8_912,
     "tools": 6_329,
-    "tests": 35_269,
+    "tests": 35_281,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

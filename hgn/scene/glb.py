@@ -41,7 +41,8 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]
     if unknown:
         raise ValueError(f"it requires {', '.join(unknown)}, which is not read; export it without")
-    least = tree.get("asset", {}).get("minVersion", "2.0")
+    asset = tree.get("asset", {})
+    least = asset.get("minVersion", "2.0" if str(asset.get("version", 2)).startswith("2") else asset["version"])
     if least != "2.0":
         raise ValueError(f"it needs glTF {least}, but only 2.0 is supported; export it as glTF 2.0")
     claims = Claims(path)
@@ -106,10 +107,11 @@ class _File:
             visited.add(index)
             if not node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True):
                 continue  # its children are invisible too
-            if "matrix" in node:
-                own_44 = np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
-            else:
-                own_44 = _places(*(node.get(name) for name in ("translation", "rotation", "scale")))[0]
+            translation, rotation, scale, matrix = (
+                _numbers(node, f"node {index} has", name, count)
+                for name, count in (("translation", 3), ("rotation", 4), ("scale", 3), ("matrix", 16))
+            )
+            own_44 = _places(translation, rotation, scale)[0] if matrix is None else np.reshape(matrix, (4, 4)).T
             place_44 = parent_44 @ own_44
             waiting += [(child, place_44) for child in node.get("children", ())]
             if "mesh" not in node:
@@ -125,8 +127,10 @@ class _File:
                 None if i is None else self.accessor(i, f"node {index} has {name}", kind)
                 for (i, name), kind in zip(given, kinds, strict=True)
             ]
-            default = self.tree["meshes"][node["mesh"]].get("weights", [])
-            result.append((node["mesh"], node.get("weights", default), place_44 @ _places(*values)))
+            mesh, name = node["mesh"], "weights"
+            default = _numbers(self.tree["meshes"][mesh], f"mesh {mesh} has", name)
+            weights = _numbers(node, f"node {index} has", name) or default or []
+            result.append((mesh, weights, place_44 @ _places(*values)))
         return result
 
     def surfaces(self, mesh: int, weights: list[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -224,6 +228,15 @@ class _File:
         if not (path.is_file() and path.is_relative_to(self.folder)):
             raise FileNotFoundError(f"it names {uri!r}, which is not a file in its folder")
         return self.read(path)
+
+
+def _numbers(entry: dict[str, Any], has: str, name: str, count: int | None = None) -> list[float] | None:
+    """Returns a list of numbers, `count` of them unless it is None; None if there is none."""
+    value = entry.get(name)
+    fits = isinstance(value, list) and set(map(type, value)) <= {int, float} and len(value) == (count or len(value))
+    if name in entry and not fits:
+        raise ValueError(f"{has} {name} {str(value)[:100]}, not a list of {count or 'any'} numbers")
+    return value
 
 
 def _places(translation: Any, rotation: Any, scale: Any) -> np.ndarray:

@@ -248,8 +248,20 @@ def test_glb_that_lies(tmp_path):
             for size in (-1, 1.5, 8.0, "8")
         ),
         *(
-            (lambda tree, n=n: tree["nodes"][0].update(translation=n), "readable GLB")
-            for n in (2.0, [5.0], [1, 2, 3, 4])
+            (lambda tree, k=k, n=n: tree["nodes"][0].update({k: n}), f"node 0 has {k} .*, not a list of")
+            for k, values in {
+                "translation": (None, 2.0, [5.0], [1, 2, 3, 4], ["1", 0, 0], [[1, 0, 0], [2, 0, 0]], [True, 0, 0]),
+                "rotation": ([[0, 0, 0, 1]], [0, 0, 1]),
+                "scale": ([[1, 1, 1]], [2]),
+                "matrix": (np.eye(4).tolist(), 15 * [0.0]),
+                "weights": ([[1, 2, 3]], "ab", None),
+            }.items()
+            for n in values
+        ),
+        (lambda tree: tree["meshes"][0].update(weights=[[1]]), "mesh 0 has weights .*, not a list of any numbers"),
+        *(
+            (lambda tree, n=n: tree["asset"].update(version=n), f"it needs glTF {n}, but only 2.0 is supported")
+            for n in ("1.0", "3.0", 1)
         ),
         (lambda tree: morphed(tree, count=4), "primitive 0 of mesh 0 has a target of 4 vertices, not 8"),
         (lambda tree: morphed(tree, sparse=minus_one), "Cannot cast array data from dtype.'int16'"),
