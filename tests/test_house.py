@@ -17,7 +17,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_239,
-    "datagen": 8_912,
+    "datagen": 8_957,
     "tools": 6_329,
     "tests": 35_281,
 }
