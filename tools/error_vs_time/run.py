@@ -78,20 +78,16 @@ class Run:
             draw(self.out, rows, self.meta)
 
     def _errors(self, i: int) -> None:
-        started = time.monotonic()
         try:
-            row = score(self.contenders[i], self.references, self.device)
+            self._rows[i] = score(self.contenders[i], self.references, self.device)
         finally:
             self.contenders[i].release()
-        self._rows[i] = row | {"scoring_s": time.monotonic() - started}
         self.write()
 
     def _times(self, i: int) -> None:
         if self.contenders[i].row["system"] not in UNTIMED:
-            started = time.monotonic()
             self.watches[i] = Stopwatch(self.contenders[i], self.references, self.device)
             self._time(i)
-            self._rows[i]["timing_s"] = time.monotonic() - started
 
     def _time(self, i: int) -> None:
         self._rows[i] |= self.watches[i].round()

@@ -89,7 +89,6 @@ def rollout_figures(
     row: dict[str, Any] = {
         "position_mse": {str(frame): float(curve_T[frame]) for frame in shown},
         "position_quartiles": {str(frame): quartiles(mse_ST[:, frame]) for frame in shown},
-        "position_by_material": _means(_position_mse(trials, references, shown)),
         "curve": [float(f"{value:.4g}") for value in curve_T],
         "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
         "sinkhorn": _means(sinkhorn),
@@ -149,34 +148,26 @@ def _penetration(position_N3: np.ndarray, reference: Episode, frame: int) -> flo
 
 
 def _of_materials(
-    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], most: int | None = None
+    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int]
 ) -> Iterator[tuple[int, str, str, np.ndarray, np.ndarray]]:
-    """Yields scene, material, frame, and the positions of the material's particles in rollout and reference.
+    """Yields scene, material, frame, and positions of particles, drawn at random, in rollout and reference.
 
-    Frames that a scene did not reach are left out. `most` limits the particles, which are drawn at random.
+    Frames that a scene did not reach are left out.
     """
     for scene, (trial, reference) in enumerate(zip(trials, references, strict=True)):
         for index in np.unique(reference.material_N):
             chosen = np.flatnonzero(reference.material_N == index)
-            if most is not None:
-                chosen = np.random.default_rng(reference.seed).permutation(chosen)[:most]
+            chosen = np.random.default_rng(reference.seed).permutation(chosen)[:SINKHORN_POINTS]
             for frame in frames:
                 if frame < trial.frame_count:
                     pair = trial.position_TN3[frame, chosen], reference.position_TN3[frame, chosen]
                     yield scene, MATERIALS[index], str(frame), *pair
 
 
-def _position_mse(
-    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int]
-) -> Iterator[OfMaterial]:
-    for scene, material, frame, predicted_N3, true_N3 in _of_materials(trials, references, frames):
-        yield scene, material, frame, float(position_mse(predicted_N3[None], true_N3[None])[0])
-
-
 def _sinkhorn(
     trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], device: torch.device
 ) -> list[OfMaterial]:
-    parts = list(_of_materials(trials, references, frames, SINKHORN_POINTS))
+    parts = list(_of_materials(trials, references, frames))
     pairs = [
         (torch.from_numpy(one_N3).to(device), torch.from_numpy(other_N3).to(device)) for *_, one_N3, other_N3 in parts
     ]
