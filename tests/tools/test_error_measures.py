@@ -23,7 +23,7 @@ from hgn.scene.motion import Motion
 from hgn.scene.shapes import shape_obstacle
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import plot, score
-from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
+from tools.error_vs_time.contenders import BaselineContender, triton_acceleration
 from tools.error_vs_time.paired import paired_difference, paired_rows, paired_table
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.run import draw
@@ -95,7 +95,7 @@ def test_one_step_errors_of_triton(episode):
     with torch.inference_mode():
         for samples in ([(more, 0), (more, 2)], [(fewer, 1), (fewer, 3)], [(more, 3)]):
             batch = make_batch(samples, network.config)
-            found_N3 = TritonPredictor(backend)(batch)
+            found_N3 = triton_acceleration(backend, batch)
             torch.testing.assert_close(found_N3, network(batch.state()), rtol=1e-4, atol=1e-8)
             made.append(backend.idle[len(samples)])
     assert made[0] is made[1] is not made[2]

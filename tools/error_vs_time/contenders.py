@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +93,7 @@ class NetworkContender(Contender):
             from hgn.runtime.triton_backend import TritonBackend  # loads Triton
 
             assert isinstance(self.simulator.backend, TritonBackend)
-            predict, at_once = TritonPredictor(self.simulator.backend), PARTICLES_AT_ONCE
+            predict, at_once = partial(triton_acceleration, self.simulator.backend), PARTICLES_AT_ONCE
         with matmul_precision(self.precision):
             return one_step(predict, self.network.config, episode, stride, self.device, at_once)
 
@@ -171,19 +172,14 @@ class FallingContender(Contender):
         return np.take_along_axis(path_TN3, frame_TN1, axis=0).clip(low, high).astype(np.float32)
 
 
-class TritonPredictor:
+def triton_acceleration(backend: TritonBackend, batch: Batch) -> torch.Tensor:
     """Predicts accelerations with backend triton: simulates one frame from each state."""
-
-    def __init__(self, backend: TritonBackend) -> None:
-        self.backend = backend
-
-    def __call__(self, batch: Batch) -> torch.Tensor:
-        state = batch.state()
-        with self.backend.stepper(state) as stepper:
-            for _ in stepper.blocks(1):
-                pass
-            output_N3 = stepper.fused.output[: len(state.position_N3), :3]  # before the constraints of the frame
-            return self.backend.network.restored_acceleration(output_N3, state)
+    state = batch.state()
+    with backend.stepper(state) as stepper:
+        for _ in stepper.blocks(1):
+            pass
+        output_N3 = stepper.fused.output[: len(state.position_N3), :3]  # before the constraints of the frame
+        return backend.network.restored_acceleration(output_N3, state)
 
 
 def one_step(
