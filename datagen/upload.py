@@ -12,7 +12,7 @@ from typing import Any
 from datagen.generate import StopSignal
 from hgn.command import run_command
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
-from hgn.data.storage import is_remote, open_storage, write_remote
+from hgn.data.storage import is_remote, open_storage, remote_storage
 from hgn.schema import ConfigError, from_mapping, printable, require
 from hgn.system.progress import bar
 
@@ -43,9 +43,9 @@ def upload(folder: Path, url: str, stop: StopSignal) -> Manifest:
     Raises: ConfigError if the URL has another data set or one that cannot be read, a local shard is altered or missing,
     or writing fails; UnreachableError.
     """
-    there: Manifest | None = None
+    there, remote = None, remote_storage(url)
     with contextlib.suppress(FileNotFoundError):
-        there = Manifest.parse(open_storage(url).manifest(MANIFEST_NAME), url)
+        there = Manifest.parse(remote.manifest(MANIFEST_NAME), url)
     try:
         content = (folder / MANIFEST_NAME).read_bytes()
     except FileNotFoundError:
@@ -64,7 +64,7 @@ def upload(folder: Path, url: str, stop: StopSignal) -> Manifest:
         for shard in manifest.shards.since(len(there.shards)):
             if stop.requested():
                 return there
-            write_remote(url, shard.name, open_storage(folder).shard(shard.name, shard.sha256, shard.bytes))
+            remote.write(shard.name, open_storage(folder).shard(shard.name, shard.sha256, shard.bytes))
             progress.update(shard.bytes)
     if (there.revision, there.requested) == (manifest.revision, manifest.requested):
         return there
@@ -72,8 +72,8 @@ def upload(folder: Path, url: str, stop: StopSignal) -> Manifest:
     have = set(there.shards.files()) if same else set()
     for name, size in manifest.shards.files():
         if (name, size) not in have:
-            write_remote(url, name, (folder / name).read_bytes()[:size])
-    write_remote(url, MANIFEST_NAME, content)  # the bytes that were read, because the file may have grown
+            remote.write(name, (folder / name).read_bytes()[:size])
+    remote.write(MANIFEST_NAME, content)  # the bytes that were read, because the file may have grown
     return manifest
 
 

@@ -120,7 +120,7 @@ def open_storage(folder: Path | str) -> Storage:
     Raises: ConfigError for a URL with an unknown protocol, or whose package is not installed.
     """
     if is_remote(folder):
-        return _at_url(str(folder))
+        return remote_storage(str(folder))
     path, typo = local_folder(folder), re.match(r"(\w+):/(?!/)|(hf)//", str(folder))
     if typo and not path.exists():
         remedy = f"did you mean {typo[1] or typo[2]}://{str(folder)[typo.end() :]}?"
@@ -172,11 +172,6 @@ def _require_address(url: str) -> None:
     require(bool(place) and address.scheme != "data", "dataset.folder", rule, url)
 
 
-def write_remote(url: str, name: str, source: Path | bytes) -> None:
-    """Writes a file, or bytes, to a data set's URL. Raises: ConfigError if writing fails; UnreachableError."""
-    _at_url(url).write(name, source)
-
-
 def dataset_token() -> str | None:
     """Returns the token of $HGN_DATASET_TOKEN. Raises: ConfigError if an HTTP header cannot contain it."""
     token = os.environ.get(TOKEN_VARIABLE)
@@ -216,18 +211,14 @@ class _Folder(Storage):
         return path
 
 
-def _at_url(url: str) -> "_Remote":
+def remote_storage(url: str) -> "RemoteStorage":
+    """Returns the storage of a URL. Raises: ConfigError, as `open_storage`."""
     _require_address(url)
     return _remote(url.rstrip("/"))
 
 
-@functools.lru_cache(maxsize=16)
-def _remote(url: str) -> "_Remote":
-    return _Remote(url)
-
-
-class _Remote(Storage):
-    """Reads a data set at a URL through fsspec."""
+class RemoteStorage(Storage):
+    """Reads and writes a data set at a URL through fsspec."""
 
     def __init__(self, url: str) -> None:
         import fsspec  # importing it is slow, and local data sets do not need it
@@ -321,6 +312,8 @@ class _Remote(Storage):
         return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size), wait_s, spared, fill)
 
     def write(self, name: str, source: Path | bytes) -> None:
+        """Writes a file, or bytes. Raises: ConfigError if writing fails; UnreachableError."""
+
         def put(path: str) -> None:
             if isinstance(source, bytes):
                 self._files.pipe_file(path, source)
@@ -377,6 +370,9 @@ class _Remote(Storage):
             raise
         self._away = 0.0, ""
         return result
+
+
+_remote = functools.lru_cache(maxsize=16)(RemoteStorage)
 
 
 def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
