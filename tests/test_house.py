@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_239,
+    "hgn": 34_232,
     "datagen": 8_957,
-    "tools": 6_329,
-    "tests": 35_281,
+    "tools": 6_312,
+    "tests": 35_283,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -37,14 +37,11 @@ class EpisodeDataModule(LightningDataModule):
         store: AnyStore,
         training: TrainingConfig,
         reader: ChunkReader,
-        chunks_ahead: int = CHUNKS_AHEAD,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
         """If `interrupted` returns True, a training on one rank ends instead of waiting for data."""
         super().__init__()
-        assert chunks_ahead >= 0
         self.store, self.training, self.reader = store, training, reader
-        self.chunks_ahead = chunks_ahead  # number of chunks read ahead; 0: a chunk is read when it is needed
         self.interrupted = interrupted
         # where to begin; a resumed run takes both from its checkpoint
         self.sampler_state, self.first_update = SamplerState(), 0
@@ -68,7 +65,7 @@ class EpisodeDataModule(LightningDataModule):
             while True:
                 started = time.monotonic()
                 self.store.ask_again()
-                for chunk in islice(drawn, self.chunks_ahead + 1 - len(waiting)):
+                for chunk in islice(drawn, CHUNKS_AHEAD + 1 - len(waiting)):
                     waiting.append(executor.submit(self.reader.read, chunk))
                 if not waiting:
                     break

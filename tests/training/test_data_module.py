@@ -123,12 +123,13 @@ def test_data_larger_than_the_cache(make_config, make_dataset, cache, monkeypatc
         return real(path, *arguments, **options)
 
     monkeypatch.setattr(files, "cat_file", cat_file)
+    monkeypatch.setattr("hgn.training.data_module.CHUNKS_AHEAD", 0)
     epoch = 32 * 2 // 2
 
     def batches(place, training):
         nonlocal given
         given = 0
-        feed, found = windows_of(place, training, chunks_ahead=0), []
+        feed, found = windows_of(place, training), []
         for batch in islice(feed.chunks(), epoch):
             found.append(batch)
             given = len(found)

@@ -128,9 +128,10 @@ def test_feeds_of_all_ranks_resume_anywhere(data):
             training = TrainingConfig(**TRAINING | {"batch_scenes": batch_scenes})
             ranks = []
             for rank in range(world_size):
-                feed = EpisodeDataModule(store, training, WindowReader(store, network, training), chunks_ahead=ahead)
+                feed = EpisodeDataModule(store, training, WindowReader(store, network, training))
                 feed.sampler_state, feed.trainer = sampler_state, Shared(rank, world_size)
-                ranks.append(list(islice(feed.chunks(), count)))
+                with mock.patch("hgn.training.data_module.CHUNKS_AHEAD", ahead):
+                    ranks.append(list(islice(feed.chunks(), count)))
             for chunks in zip(*ranks, strict=True):
                 update = [seed for chunk in chunks for seed in chunk.batch.seeds_S]
                 assert sorted(update) == sorted(seeds[len(seen) :][: len(update)])
