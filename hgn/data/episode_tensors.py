@@ -34,7 +34,7 @@ class EpisodeTensors:
     gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # symmetries that training may apply to the scene
     barrier: Barrier | None = None  # barrier of the scene's obstacles, if simulations respect them
-    wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
+    wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls normal to x, y, z
     parameter_NP: torch.Tensor | None = None  # as in ParticleState
     rest: RestShape | None = None  # as in ParticleState
     moving: tuple[MovingObstacle, ...] = ()  # for networks that have them as inputs

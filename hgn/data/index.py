@@ -151,7 +151,7 @@ class Index(Sequence[ShardEntry]):
             count += len(rest)
 
     def locate(self, split: str, episode: int) -> tuple[ShardEntry, EpisodeEntry]:
-        """Returns the shard and the entry of an episode, by the episode's place in the split. Raises: IndexError."""
+        """Returns the shard and the entry of an episode, by the episode's index in the split. Raises: IndexError."""
         if not 0 <= episode < self.totals[split].episodes:
             raise IndexError(episode)
         segment = self._first_beyond(split, episode)
@@ -164,7 +164,7 @@ class Index(Sequence[ShardEntry]):
         return shard, shard.episodes[episode - before]
 
     def particles(self, split: str, episodes: Sequence[int]) -> list[int]:
-        """Returns the particle counts of episodes, by their places in the split. Each segment is read once."""
+        """Returns the particle counts of episodes, by their indices in the split. Each segment is read once."""
         particles = self._read.particles[split]
         with self._read.lock:
             particles.extend([-1] * (self.totals[split].episodes - len(particles)))

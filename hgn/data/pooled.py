@@ -17,12 +17,12 @@ from hgn.scene.episode import Episode
 class PooledStore(Episodes):
     """Joins one split of several data sets: first `others`, which stay as they were opened, then `own`, which may grow.
 
-    It is used like an EpisodeStore. The place of an episode counts over all data sets.
+    It is used like an EpisodeStore. The index of an episode counts over all data sets.
     """
 
     def __init__(self, own: EpisodeStore, others: Sequence[EpisodeStore]) -> None:
         self.own, self.others = own, tuple(others)
-        self._starts = np.cumsum([0, *map(len, self.others)])  # place of the first episode of each data set
+        self._starts = np.cumsum([0, *map(len, self.others)])  # index of the first episode of each data set
         self._still = int(self._starts[-1])
 
     @property
@@ -88,7 +88,7 @@ class PooledStore(Episodes):
         return store.read(place)
 
     def _place(self, index: int) -> tuple[EpisodeStore, int]:
-        """Returns the store of an episode, and the episode's place in it."""
+        """Returns the store of an episode, and the episode's index in it."""
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
         return (*self.others, self.own)[number], index - int(self._starts[number])
 

@@ -41,7 +41,7 @@ class Episodes(Sequence[Episode], ABC):
 
     @abstractmethod
     def read(self, index: int) -> Episode:
-        """Returns the episode at a place from 0."""
+        """Returns the episode at an index from 0."""
 
     @property
     @abstractmethod
@@ -231,7 +231,7 @@ class EpisodeStore(Episodes):
         return self.manifest.shards.particles(self.split, episodes)
 
     def statistics(self) -> Statistics:
-        """Returns mean and spread of velocity and acceleration of this split, in frame units."""
+        """Returns mean and standard deviation of velocity and acceleration of this split, in frame units."""
         return self.manifest.statistics(self.split)
 
     def __len__(self) -> int:

@@ -73,7 +73,7 @@ class Episode:
     materials: tuple[str, ...] = MATERIALS  # imported sets append their own names
     past_HN3: np.ndarray | None = None  # float32, the frames before frame 0, oldest first; None: free flight
     boundary_P3: np.ndarray | None = None  # float32, particles at rest that represent obstacles
-    wall_friction: Vector = (0.0, 0.0, 0.0)  # Coulomb coefficients of the domain's walls across x, y and z
+    wall_friction: Vector = (0.0, 0.0, 0.0)  # Coulomb coefficients of the domain's walls normal to x, y and z
 
     def __post_init__(self) -> None:
         require(bool(_NAME.fullmatch(self.key)), "key", "letters, digits, - and _ (a dot would end it)", self.key)

@@ -22,7 +22,7 @@ CAUGHT = 0.5  # inner fraction of a square's horizontal width; groups are placed
 
 @dataclass(frozen=True)
 class Funnel:
-    """The places of a funnel's parts relative to the centre of its hole. Domain units."""
+    """The positions of a funnel's parts relative to the centre of its hole. Domain units."""
 
     size: float  # side of the four squares
     quaternion: tuple[Quaternion, ...]  # rotation of each square

@@ -15,7 +15,7 @@ from hgn.scene.rotation import rotate
 from hgn.schema import Vector, require
 
 LEAST_S = 1e-9  # least time between two keyframes, in seconds; in less an obstacle's speed could be infinite
-FARTHEST = 1000.0  # largest translation of a keyframe, domain units: networks follow the cells on its way
+FARTHEST = 1000.0  # largest translation of a keyframe, domain units: networks follow the cells on its path
 TURN_STEPS = 16  # steps in which boxes follow a turn between two keyframes
 UNIT = 1e-6  # largest difference of a rotation's product with its transpose from the identity
 Keyframes = Sequence[tuple[float, Vector]]  # times in seconds and translations in domain units
@@ -67,7 +67,7 @@ class Motion:
         return turned(fraction * turn) @ self.rotation_T33[after - 1], begin + fraction * (end - begin)
 
     def place(self, point_P3: np.ndarray, time: float) -> np.ndarray:
-        """Returns the places of the obstacle's points at a time, float64 [P, 3]."""
+        """Returns the positions of the obstacle's points at a time, float64 [P, 3]."""
         rotation, translation = self.pose(time)
         return rotate(np.asarray(point_P3, np.float64) - self.pivot, rotation) + self.pivot + translation
 

@@ -1,4 +1,4 @@
-"""Obstacles in motion: the cells of each are computed once, at its place in the scene, and then move with it.
+"""Obstacles in motion: the cells of each are computed once, in its first pose, and then move with it.
 
 Shape legend: F triangles.
 """
@@ -21,7 +21,7 @@ from hgn.scene.surface_field import surface_field
 
 @dataclass(frozen=True, eq=False)
 class MovingObstacle:
-    """An obstacle at its place in the scene, and its motion from there."""
+    """An obstacle in its pose of the scene file, and its motion from there."""
 
     grid: ObstacleGrid
     corner_F33: np.ndarray  # float64, domain units

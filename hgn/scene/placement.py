@@ -51,7 +51,7 @@ class Placed:
 
 
 def place_shape(shape: str, size: float, position: Vector, quaternion: Quaternion, index: int) -> Placed:
-    """Returns obstacle number `index` of a scene: a built-in shape or a mesh file with its size and place."""
+    """Returns obstacle number `index` of a scene: a built-in shape or a mesh file with its size and position."""
     rotation_33 = quaternion_rotation(quaternion)
     obstacle = shape_obstacle(shape, size, position, rotation_33, f"obstacle_{index}_{Path(shape).stem}")
     unit_surface_P3, unit_gap = unit_surface_points(shape)

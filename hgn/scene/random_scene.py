@@ -44,7 +44,7 @@ LONE_CELLS = 6  # smallest distance of a lone particle from others, in solver ce
 
 
 class _NoRoomError(Exception):
-    """An item found no place in this layout."""
+    """An item does not fit into this layout."""
 
 
 def generate_scene(config: SceneConfig, seed: int) -> Scene:
@@ -53,7 +53,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     The scene's gravity is the config's, zero, or drawn. If the config names `kinds`, the scene is of one of them
     (hgn.scene.world). Obstacles lie in the domain, at least CLEARANCE_CELLS solver cells apart and none inside another,
     except for the four squares of a funnel, which cross. Groups keep the same distance from obstacles, from each other
-    and from the solver's walls. An item that does not fit gets a new place, then a new shape, then a new layout.
+    and from the solver's walls. An item that does not fit gets a new position, then a new shape, then a new layout.
     `Scene.specification` records every choice in plain JSON types.
 
     Raises: ConfigError if an item does not fit. The message names the setting to change.
@@ -96,13 +96,13 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
 
 @dataclass(frozen=True)
 class _PlacedFunnel:
-    """A funnel and the place of its hole's centre."""
+    """A funnel and the position of its hole's centre."""
 
     funnel: Funnel
     hole_3: np.ndarray
 
     def place(self, rng: np.random.Generator) -> np.ndarray:
-        """Draws a place, uniform in the space above the hole and above the inner halves of the squares."""
+        """Draws a position, uniform in the space above the hole and above the inner halves of the squares."""
         low_3, high_3 = self.funnel.low_3, self.funnel.high_3
         local_3 = low_3 + (high_3 - low_3) * rng.random(3)
         return self.hole_3 + rotate(local_3[None], self.funnel.rotation_33)[0]
@@ -230,7 +230,7 @@ def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
 
 
 def _purify(config: SceneConfig, bodies: list[Body], gravity: Vector, rng: np.random.Generator) -> list[Body]:
-    """Gives some of the moving groups a velocity exactly along gravity, against it or across it, uniform in size.
+    """Gives some of the moving groups a velocity exactly along gravity, against it or normal to it, uniform in size.
 
     Without gravity y is up.
     """

@@ -393,7 +393,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     if points.shape != (shown_TP.sum(), 3) or (count_T != shown_TP.sum(axis=1)).any():
         raise ConfigError(f"Points must contain {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
     position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
-    with np.errstate(over="ignore"):  # infinite places of particles are refused
+    with np.errstate(over="ignore"):  # infinite positions of particles are refused
         position_TP3[shown_TP] = points[()]
     source = strict_json(own["source"][()])
     require(isinstance(source, dict), "source", "a mapping", source)

@@ -103,7 +103,7 @@ class Scene:
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
     # density of the initial filling, if known; the solver then relaxes the density of water towards it
     particles_per_cell: float | None = None
-    # Coulomb coefficients of the domain's walls across x, y (floor and ceiling) and z
+    # Coulomb coefficients of the domain's walls normal to x, y (floor and ceiling) and z
     wall_friction: Vector = (0.0, 0.0, 0.0)
     # float64 [N], seconds, sorted: the time at which each particle enters at its position and velocity; 0: it is
     # present from the start. None: all are

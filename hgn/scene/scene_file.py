@@ -57,7 +57,7 @@ EMITTER_STREAM = 2**31  # key of the emitters' random streams, which are separat
 
 @dataclass(frozen=True)
 class KeyframeEntry(Bounded):
-    """A pose of an obstacle relative to its initial place."""
+    """A pose of an obstacle relative to its initial pose."""
 
     time: NonNegative[float]  # seconds
     translation: Vector = (0.0, 0.0, 0.0)
@@ -137,7 +137,7 @@ class GroupEntry(MaterialEntry):
 
     shape: str | None = None  # cube, sphere or box
     size: float | tuple[float, float, float] | None = None  # side, diameter, or the three edges of a box
-    position: Vector | None = None  # place of the centre
+    position: Vector | None = None  # position of the centre
     particles: PathName | None = None  # .npz with position and optionally velocity [N, 3], or USD; relative to the file
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
 
@@ -175,7 +175,7 @@ class EmitterEntry(MaterialEntry):
 
     shape: str  # disc or rectangle, perpendicular to the velocity
     size: float | tuple[float, float]  # diameter, or the edges of a rectangle; the first one is horizontal
-    position: Vector  # place of the centre
+    position: Vector  # position of the centre
     velocity: Vector  # velocity of entering particles, domain units per second
     stop: NonNegative[float]  # seconds after the start of the simulation
     start: NonNegative[float] = 0.0

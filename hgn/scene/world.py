@@ -391,7 +391,7 @@ _PLACED: dict[str, Callable[[Layout], None]] = {
 
 
 def _paper(new: Layout) -> SceneConfig:
-    """Returns settings for random_scene, for a kind whose groups and obstacles have random places as in the paper."""
+    """Returns settings for random_scene, for a kind with random positions of groups and obstacles, as in the paper."""
     new.take_domain("room", "hall")
     config = replace(new.config, kinds={}, domain_size=new.domain, group_size=new("size"))
     volume = (config.group_size / config.cell_size) * (config.group_size / config.cell_size)

@@ -140,7 +140,7 @@ def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) ->
 
 
 def _passing(error: Exception, url: str, field: str) -> str | None:
-    """Returns the cause of a temporary error, or None. Raises ConfigError for an error that repeating cannot mend."""
+    """Returns the cause of a temporary error, or None. Raises ConfigError for an error that repeating cannot fix."""
     from huggingface_hub import errors
 
     status = getattr(getattr(error, "response", None), "status_code", None)

@@ -52,7 +52,7 @@ class DeviceEpisode:
     gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; only relative inputs use it
     symmetries: tuple[Symmetry, ...] = ()  # with training.symmetry one of them is drawn for each sample
     barrier: SceneHash | None = None  # the barrier of the episode's simulations
-    wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
+    wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls normal to x, y, z
     parameter_NP: torch.Tensor | None = None  # float32, columns of hgn.network.own_physics; None: all are 0
     rest: RestShape | None = None  # None: no elastic bodies
     moving: EpisodeMoving = NONE_MOVES
