@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_232,
     "datagen": 8_957,
     "tools": 6_312,
-    "tests": 35_283,
+    "tests": 35_282,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

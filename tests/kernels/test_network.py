@@ -93,8 +93,8 @@ def test_cases_are_what_they_say():
 @pytest.mark.parametrize("precision", ["fp32", "fp16"] if device().type == "cpu" else ["fp32", "tf32", "fp16"])
 @pytest.mark.usefixtures("large_tiles")
 def test_free_motion_is_exact(precision):
-    """Away from surfaces what inference adds to gravity keeps momentum and angular momentum in each scene to float32's
-    rounding; 3 m/s more for all, in any direction, leave it as it was to the rounding of velocities."""
+    """Away from surfaces the accelerations minus gravity conserve momentum and angular momentum of each scene up to the
+    rounding of float32. A common velocity of 3 m/s changes them only by the rounding of velocities."""
     network = CASES["relative"].network()
     state = moving_state((9, 3), obstacles=False, spread=0.06)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))

@@ -1,4 +1,4 @@
-"""What leaves a network's accelerations as they are, and what they keep: for any weights, in float64."""
+"""Invariances and conservation laws of a network's accelerations, for any parameters, in float64."""
 
 from dataclasses import replace
 from functools import partial
@@ -26,7 +26,7 @@ def reordered(state):
 
 
 def elsewhere(state):
-    """With the grid's origin."""
+    """Shifts particles and the grid's origin together."""
     origin_S3 = SHIFT_3.expand(state.scene_count, 3)
     return replace(state, position_N3=state.position_N3 + SHIFT_3), origin_S3, slice(None)
 
@@ -48,8 +48,8 @@ def faster(*velocity):
     ],
 )
 def test_accelerations_stay(kind, change):
-    """In another order of particles; away from surfaces, with relative inputs, elsewhere and with up to 3 m/s more for
-    all, whatever the particles do among themselves; and they depend on that."""
+    """Accelerations do not depend on the order of particles. With relative inputs and away from surfaces they do not
+    depend on the position or on a common velocity of up to 3 m/s, but they depend on relative velocities."""
     network = KINDS[kind]()
     for counts in ((40, 17, 1), (1,)):
         state = airborne(counts)
@@ -63,8 +63,8 @@ def test_accelerations_stay(kind, change):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_scene_is_alone(kind):
-    """A scene's accelerations in a batch of other gravities are those that it has alone with its own; a scene without
-    particles has none."""
+    """A scene's accelerations do not depend on the other scenes of its batch, which have other gravities. A scene
+    without particles has no accelerations."""
     network, state = KINDS[kind](), airborne()
     together_N3 = network(state)
     for scene in range(3):
@@ -77,8 +77,8 @@ def test_each_scene_is_alone(kind):
 
 @pytest.mark.parametrize("gap", [0.0701, 0.0349])
 def test_bodies_apart_do_not_act_on_each_other(gap):
-    """With local inputs a body that is 2 R from others has the accelerations that it has alone, near walls, obstacles
-    and a fast body in the same coarse cells; one nearer than R acts on it."""
+    """With local inputs bodies at least 2 R apart do not act on each other, near walls and obstacles and in the same
+    coarse cells as a fast body. A body nearer than R acts."""
     network, state = network_of(inputs="local", levels=4), random_state((90,), spread=0.06)
     position_N3, velocity_NM3 = state.position_N3.clone(), state.velocity_NM3.clone()
     position_N3[60:, 0] += position_N3[:60, 0].max() - position_N3[60:, 0].min() + gap
@@ -99,9 +99,8 @@ def test_bodies_apart_do_not_act_on_each_other(gap):
     ],
 )
 def test_free_flight_in_one_piece_is_exact(velocity, gravity):
-    """With any weights, velocity up to 10 m/s and gravity, what flies freely as one has the acceleration g to rounding,
-    and so has a single particle, however it got there; all columns show nothing, exactly so for numbers with short
-    binary fractions."""
+    """With any parameters, gravity and velocity up to 10 m/s, a rigid body or a single particle in free flight has the
+    acceleration g up to rounding. All columns are 0, exactly for numbers with short binary fractions."""
     network, gravity_3 = network_of(inputs="relative"), torch.tensor(gravity, dtype=torch.float64)
     state = in_flight(airborne(), velocity, gravity_3)
     torch.testing.assert_close(network(state), gravity_3.expand_as(state.position_N3), rtol=0, atol=1e-15)
@@ -112,14 +111,14 @@ def test_free_flight_in_one_piece_is_exact(velocity, gravity):
 
 @pytest.mark.parametrize("levels", [1, 2, 3])
 def test_momentum_is_kept_where_nothing_touches(levels):
-    """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
-    theirs, on lines, planes and in one place, sum to gravity's, and their moments to 0. Near a wall they do not, nor do
-    those of a part; and the means of cells differ."""
+    """With any parameters and motion, the accelerations minus gravity sum to 0, and so do their moments: over many
+    coarsest cells, in one, and for particles on a line, on a plane or at one point. The sums are not 0 near a wall or
+    for a part of the particles."""
     network = network_of(inputs="relative", levels=levels)
     state = airborne((60, 17, 1, 40, *map(len, ODD_BODIES)))
     place_N3 = torch.where((state.scene_N == 3)[:, None], 0.35 + state.position_N3 / 2, state.position_N3)
     place_N3[118:] = torch.cat(ODD_BODIES)
-    state = replace(state, position_N3=place_N3)  # the fourth scene lies closely
+    state = replace(state, position_N3=place_N3)  # the particles of the fourth scene are close together
     extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
     moment_N3 = torch.linalg.cross(place_N3 - 0.5, extra_N3)
     for scene in range(state.scene_count):
@@ -148,8 +147,8 @@ def test_momentum_is_kept_where_nothing_touches(levels):
     ],
 )
 def test_bodies_slip_on_a_plane(inputs, height, pushes):
-    """A floor pushes a body up or down only, whatever the weights, motions and materials: along it what is added to
-    gravity sums to 0. With local inputs a floor 1.8 R below does not push. `height` is in R."""
+    """With any parameters, motions and materials a floor pushes along its normal only: accelerations minus gravity sum
+    to 0 along the floor. With local inputs a floor 1.8 R below does not push. `height` is in R."""
     network, state = network_of(inputs=inputs), airborne((40,))
     low = state.position_N3[:, 1].min() - height * network.config.cell_size
     velocity_NM3 = state.velocity_NM3 * torch.tensor([1.0, inputs != "local", 1.0])  # none approaches the floor
@@ -162,8 +161,8 @@ def test_bodies_slip_on_a_plane(inputs, height, pushes):
 
 
 def test_one_scale_for_all_axes():
-    """The scale is the root mean square of the axes' spreads with the noise, there are no means; the target is the
-    inverse of what the output means."""
+    """The scale is the root mean square of the axes' standard deviations with noise, and means are 0. `target` inverts
+    `restored_acceleration`."""
     normaliser = Normaliser()
     normaliser.set_isotropic(torch.tensor([3e-3, 0.0, 6e-3]), 4e-3)
     expected = ((9 + 0 + 36) / 3 + 16) ** 0.5 * 1e-3
