@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 34_232,
     "datagen": 8_957,
-    "tools": 6_312,
-    "tests": 35_282,
+    "tools": 6_301,
+    "tests": 35_377,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

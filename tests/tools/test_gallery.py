@@ -15,12 +15,14 @@ from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene_file import find_scene, load_scene, scene_files
 from hgn.schema import ConfigError, from_mapping
 from tools import render
+from tools.report import finite
 from tools.scenes import filled
 from tools.stability import gallery, network, solver, solver_gallery
 from tools.stability.broken import BROKEN
 from tools.stability.case import gallery_cases
 from tools.stability.gallery import load_case, load_gallery
 from tools.stability.observables import OBSERVABLES, BoundEntry, Film, period, series
+from tools.stability.row import Report
 
 pytestmark = pytest.mark.usefixtures("solver_kernels")
 
@@ -198,7 +200,7 @@ def test_draws(tmp_path):
 
 
 def test_both_commands(tmp_path, monkeypatch, capsys):
-    """The solver writes figures on both grids and the table of broken trajectories; a network is compared with them.
+    """The solver writes figures on both grids and of broken trajectories; a network is compared with them.
 
     A network that holds particles still fails, a changed scene is refused, a changed bound is not.
     """
@@ -221,8 +223,8 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     assert all(set(row["solver"]) == {"64", "96"} and set(row["broken"]) == set(BROKEN) for row in rows)
     assert rows[0]["held"] and {"frozen", "compressed"} <= set(rows[0]["caught"])
     assert rows[1]["held"] and "drifting" in rows[1]["caught"]
-    printed = capsys.readouterr().out
-    assert "| frozen" in printed and "fails, as it should" in printed
+    failed, summary = capsys.readouterr().out.splitlines()
+    assert failed.startswith("FAILS  tiny: far_effect, frame 10: ") and summary == "2 of 3 rows pass"
     own = report["scenes"]["tiny"]
     assert own["kind"] == "drop" and len(own["series"]["64"]["height"].split()) == 2
     assert own["simulated"]["date"] == report["meta"]["date"]
@@ -243,11 +245,96 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     assert solver.main({"cases": ["gallery"], "device": "cpu", "json": str(tmp_path / "again.json")}) == 0
     again = json.loads((tmp_path / "again.json").read_text())
     assert again["scenes"]["tiny"] == own and [row["held"] for row in again["rows"]] == [False, True]
-    assert again["rows"][0]["beyond"].endswith("fails: no broken trajectory")
+    assert "; no broken trajectory fails: frozen " in again["rows"][0]["beyond"]
     assert again["rows"][1]["broken"] == rows[1]["broken"]
     tiny_file(tmp_path, far=None, bounds=[{"of": "height", "frames": [10, 10], "within": 90.0}])
     with pytest.raises(ConfigError, match=r"tiny.yaml must be as it was when gallery_solver.json was measured"):
         network.main(options)
+
+
+def falling(scenes, config, frames, *_):
+    """Trajectories of the solver's form, without the solver: figures have more digits than the JSON stores."""
+    fall_T11 = 0.0123456789 * (np.arange(frames)[:, None, None] / frames) ** 2
+    return [RolloutResult((scene.position_N3 - [0.3, 1.0, 0.0] * fall_T11).astype(np.float32)) for scene in scenes]
+
+
+def test_one_scene(tmp_path, monkeypatch, capsys):
+    """Both commands check scenes by name. The solver's JSON keeps the rows of all other scenes, in order; the network's
+    has only rows of the chosen scenes. Wrong names and frames are refused before a simulation."""
+    files = {name: tiny_file(tmp_path).rename(tmp_path / f"{name}.yaml") for name in ("a", "c", "mine", "z")}
+    shown, simulated = dict(files), []
+    del shown["mine"]
+
+    def trials(scenes, *options):
+        simulated.extend(scenes)
+        return falling(scenes, *options)
+
+    for module in (gallery, solver_gallery):
+        monkeypatch.setattr(module, "scene_files", lambda folder: shown)
+    for module in ("case", "solver_gallery"):
+        monkeypatch.setattr(f"tools.stability.{module}.REFERENCE", tmp_path)
+    monkeypatch.setattr(solver_gallery, "solver_trials", trials)
+    json_file, own_file = tmp_path / "gallery_solver.json", tmp_path / "network.json"
+
+    def solve(*cases, file=json_file):
+        capsys.readouterr()
+        simulated.clear()
+        assert solver.main({"cases": list(cases), "device": "cpu", "json": str(file)}) == 0
+        return capsys.readouterr().out.splitlines(), json.loads(file.read_text())
+
+    def check(*cases):
+        capsys.readouterr()
+        options = {"weights": still_weights(tmp_path), "device": "cpu", "json": str(own_file)}
+        assert network.main(options | {"cases": list(cases)}) == 0
+        return capsys.readouterr().out.splitlines(), json.loads(own_file.read_text())
+
+    # without stored figures of the other scenes the JSON is one of a part, and refused as that of the gallery
+    printed, part = solve("gallery:c")
+    assert list(part["scenes"]) == ["c"] and len(simulated) == 4
+    assert [line.partition(":")[0] for line in printed] == [*3 * ["passes c"], "3 of 3 rows pass"]
+    with pytest.raises(ConfigError, match=r"a.yaml must be as it was when gallery_solver.json was measured"):
+        check("gallery")
+    printed, before = solve("gallery")
+    assert list(before["scenes"]) == ["a", "c", "z"] and len(simulated) == 8
+    assert printed == ["9 of 9 rows pass"]
+    printed, again = solve("gallery", file=tmp_path / "again.json")
+    assert not simulated and [again[key] for key in ("rows", "scenes")] == [before[key] for key in ("rows", "scenes")]
+
+    shown = dict(files)
+    printed, after = solve("gallery:mine", "gallery:z")
+    assert len(simulated) == 4 and len(printed) == 7 and printed[-1] == "6 of 6 rows pass"
+    assert all(line.startswith(("passes mine: ", "passes z: ")) for line in printed[:-1])
+    assert list(after["scenes"]) == ["a", "c", "mine", "z"]
+    assert [row["scene"] for row in after["rows"]] == [name for name in after["scenes"] for _ in range(3)]
+    assert after["scenes"].pop("mine") and json.dumps(after["scenes"]) == json.dumps(before["scenes"])
+    assert json.dumps([row for row in after["rows"] if row["scene"] != "mine"]) == json.dumps(before["rows"])
+
+    printed, judged = check("gallery:mine")
+    assert len(printed) == 4 and "FAILS  mine: height" in printed[0] and printed[-1] == "2 of 3 rows pass"
+    assert len(judged["rows"]) == 3 and judged["meta"]["config"]["cases"] == ["gallery:mine"]
+    printed, judged = check("gallery")
+    assert len(judged["rows"]) == 12 and printed[-1] == "8 of 12 rows pass"
+    assert [line[:6] for line in printed[:-1]] == 4 * ["FAILS "]
+
+    monkeypatch.setattr("datagen.mpm.device.initialise", lambda *_: pytest.fail("the solver started"))
+    for command in (solve, check):
+        with pytest.raises(ConfigError, match=r"^cases must be scenes of conf/gallery, .*; did you mean mine\?$"):
+            command("gallery:mein")
+    with pytest.raises(ConfigError, match=r"^json must be left out with several draws of the gallery"):
+        solve("gallery:c", "gallery_1")
+    tiny_file(tmp_path, bounds=[{"of": "height", "frames": [5, 15], "within": 1}]).rename(files["mine"])
+    with pytest.raises(ConfigError, match=r"mine.yaml: measure.bounds\[0\].frames must be below frames \(11\), got 15"):
+        solve("gallery:mine")
+
+
+def test_other_settings_of_the_solver():
+    """Rows that were simulated with other settings are not copied, and not dropped."""
+    report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
+    mpm = from_mapping(MpmConfig, report["meta"]["solver"] | {"snow_hardening": 9.0})
+    chosen = {case.name: case.gallery for case in loaded()[:1]}
+    rows = solver_gallery.gallery_rows("gallery", chosen, mpm, Report("solver", {}, None, scenes={}))
+    with pytest.raises(ConfigError, match=r"cases must be the whole gallery where .* has other settings of the solver"):
+        next(rows)
 
 
 def test_the_stored_figures_pass():
@@ -255,6 +342,12 @@ def test_the_stored_figures_pass():
     broken trajectory fails."""
     report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
     rows = {row["case"]: row for row in report["rows"]}
+    chosen = {case.name: case.gallery for case in loaded()}
+    made = Report("solver", report["meta"], None, scenes={})
+    mpm = from_mapping(MpmConfig, report["meta"]["solver"])
+    made.add(solver_gallery.gallery_rows("gallery", chosen, mpm, made), brief=True)
+    assert json.dumps(finite(made.rows)) == json.dumps(report["rows"]), "a new run would change stored rows"
+    assert json.dumps(made.more["scenes"]) == json.dumps(report["scenes"])
     for case in loaded():
         series = report["scenes"][case.name]["series"]
         for bound in case.gallery.measure.bounds:
@@ -281,9 +374,11 @@ def test_damaged_figures(tmp_path, monkeypatch, depth, value):
     (tmp_path / "gallery_solver.json").write_text(text)
     for module in ("tools.stability.case", "tools.stability.solver_gallery"):
         monkeypatch.setattr(f"{module}.REFERENCE", tmp_path)
-        monkeypatch.setattr(f"{module}.load_gallery", lambda _: [case.gallery])
+    monkeypatch.setattr("tools.stability.case.load_gallery", lambda _: [case.gallery])
     monkeypatch.setattr(solver_gallery, "solver_trials", lambda *_: pytest.fail("simulated"))
-    for read in (lambda: gallery_cases("gallery"), lambda: next(solver_gallery.gallery_rows("gallery", mpm, {}, {}))):
+    solved = Report("solver", {}, None, scenes={})
+    rows = solver_gallery.gallery_rows("gallery", {case.name: case.gallery}, mpm, solved)
+    for read in (lambda: gallery_cases("gallery"), lambda: next(rows)):
         with pytest.raises(ConfigError, match=r"solver.json must be a report of .*run python -m tools.stab"):
             read()
 

@@ -67,6 +67,7 @@ class Case:
     nominal: tuple[Scene, ...] = ()  # the scenes with the default of the parameter, for the solver only
     gallery: GalleryCase | None = None  # the file of a gallery scene, which has bounds instead of limits
     references: tuple[float, ...] = ()  # the solver's figures, one for each bound of the gallery scene
+    brief: bool = False  # rows that pass are counted, and not printed
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,8 @@ def cut(trials: Sequence[RolloutResult], last_frames: Sequence[int]) -> list[Rol
 def gallery_cases(case: str) -> list[Case]:
     """Returns the scenes as cases, with the solver's figures from the JSON of `tools.stability solver`."""
     loaded = load_gallery(case)
-    file = REFERENCE / f"{case}_solver.json"
+    draw, _, scene = case.partition(":")
+    file = REFERENCE / f"{draw}_solver.json"
     command = f"run python -m tools.stability solver 'cases=[{case}]' --json {file}"
     require(file.is_file(), "cases", f"{case} only where {file} has the solver's figures", case, command)
     cases = []
@@ -114,5 +116,6 @@ def gallery_cases(case: str) -> list[Case]:
             lacking = [bound.key for bound in each.measure.bounds if bound.key not in grid]
             require(not lacking, str(each.file), rule, f"a new row: {', '.join(lacking)}", command)
             figures = tuple(bound.reduced_line(grid[bound.key]) for bound in each.measure.bounds)
-            cases.append(Case(each.name, each.scenes, each.measure.frames, (), gallery=each, references=figures))
+            frames = each.measure.frames
+            cases.append(Case(each.name, each.scenes, frames, (), gallery=each, references=figures, brief=not scene))
     return cases

@@ -19,12 +19,13 @@ import numpy as np
 
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import MEASURE, GroupEntry, SceneFile, read_mapping, scene_files, scene_of
-from hgn.schema import ConfigError, FrameCount, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, FrameCount, from_mapping, known_keys, require, require_bounds, to_mapping
 from tools.scenes import joined
 from tools.stability.observables import LACKS, BoundEntry, Film
 
 GALLERY = "gallery"
-NAME = re.compile(rf"{GALLERY}(?:_(\d+))?")  # name of a case, with the number of a draw
+NAME = re.compile(rf"({GALLERY}(?:_(\d+))?)(?::(.+))?")  # a case: a draw of the gallery, or one scene of a draw
+GALLERY_CASES = "gallery, gallery_NUMBER, gallery:SCENE, gallery_NUMBER:SCENE"  # for messages
 GRID_CELLS = (64, 96)  # solver cells per unit of length
 REFERENCE = Path(__file__).parents[2] / "results" / "stability"
 ATTEMPTS = 20  # largest number of attempts at a draw, if its groups have too little space
@@ -102,18 +103,20 @@ class GalleryCase:
 
 
 def is_gallery(name: str) -> bool:
-    """Returns whether a case is the gallery or a draw of it."""
+    """Returns whether a case is the gallery, a draw of it, or one of their scenes."""
     return NAME.fullmatch(name) is not None
 
 
 def load_gallery(case: str = GALLERY) -> list[GalleryCase]:
-    """Returns the scenes of a case such as gallery or gallery_1. Raises: ConfigError, starting with the file."""
+    """Returns the scenes of a case such as gallery_1 or gallery:tap. Raises: ConfigError, starting with the file."""
     match = NAME.fullmatch(case)
     assert match is not None
-    draw = int(match[1] or 0)
     files = scene_files(GALLERY)
     require(len(files) > 0, "cases", "without gallery where conf/gallery has no scenes", case)
-    return [load_case(name, file, draw) for name, file in files.items()]
+    if scene := match[3]:
+        require(scene in files, "cases", "scenes of conf/gallery", case, known_keys(scene, files, "scenes"))
+        files = {scene: files[scene]}
+    return [load_case(name, file, int(match[2] or 0)) for name, file in files.items()]
 
 
 def load_case(name: str, file: Path, draw: int = 0) -> GalleryCase:

@@ -20,14 +20,14 @@ from tools.report import meta_of
 from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut, gallery_cases
 from tools.stability.checks import gallery_rows, refused, row_of
-from tools.stability.gallery import is_gallery
+from tools.stability.gallery import GALLERY_CASES, is_gallery
 from tools.stability.network_cases import FAMILIES, PARAMETERS, Context
 from tools.stability.parameters import parameter_row
-from tools.stability.row import Report, Row, table
+from tools.stability.row import Report, Row
 from tools.timing import FrameClock
 
 CaseName = Annotated[
-    str, Bound(f"one of {', '.join(FAMILIES)}, gallery, gallery_NUMBER", lambda n: n in FAMILIES or is_gallery(n))
+    str, Bound(f"one of {', '.join(FAMILIES)}, {GALLERY_CASES}", lambda n: n in FAMILIES or is_gallery(n))
 ]
 
 
@@ -39,7 +39,7 @@ class StabilityNetworkConfig(SimulatorConfig, Bounded):
     # throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far; null: all of these.
     # parameters: friction and constants of materials; a quarter of an hour on one core.
     # gallery: the scenes of conf/gallery against the solver's figures; gallery_1: the draw for
-    # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw
+    # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw; gallery:SCENE: one scene
     cases: tuple[CaseName, ...] | None = None
     frames: FrameCount = 300  # of each rollout
     long_frames: FrameCount = 3000  # of the case rest
@@ -52,7 +52,7 @@ class StabilityNetworkConfig(SimulatorConfig, Bounded):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if `json` is given. A case that fails is a finding: exit code 0."""
+    """Prints rows, and writes JSON if `json` is given. A case that fails is a finding: exit code 0."""
     started = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
@@ -67,10 +67,9 @@ def main(mapping: dict[str, Any]) -> int:
     report.meta["seconds_before_cases"] = time.monotonic() - started
     for number, case in enumerate(cases, start=1):
         print(f"case {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
-        report.add(runner.rows(case))
+        report.add(runner.rows(case), case.brief)
     report.meta["seconds"] = time.monotonic() - started
-    report.write()
-    print(table(report.rows))
+    report.close()
     return 0
 
 

@@ -1,7 +1,6 @@
-"""Rows of the stability reports, their table and their JSON."""
+"""Rows of the stability reports and their JSON."""
 
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,38 +25,31 @@ def within(case: str, bound: float, measured: float, beyond: str) -> Row:
 
 
 class Report:
-    """Collects rows: prints a line to stderr as each case ends, and writes the JSON after each."""
+    """Collects rows: prints a line as each case ends, and writes the JSON after each."""
 
     def __init__(self, part: str, meta: dict[str, Any], file: str | None, **more: Any) -> None:
         self.part, self.meta, self.file, self.more = part, meta, file, more
-        self.rows: list[Row] = []
+        self.rows: list[dict[str, Any]] = []  # as in the JSON; rows of an earlier report may be among them
+        self.passes: list[bool] = []  # of the rows of this run
 
-    def add(self, rows: Iterable[Row]) -> None:
-        """Adds rows one by one."""
+    def add(self, rows: Iterable[Row], brief: bool = False) -> None:
+        """Adds rows one by one. If `brief`, only those that fail are printed."""
         for row in rows:
-            self.rows.append(row)
-            measured, predicted = _figures(row)
-            verdict = "passes" if row.held else "FAILS "
-            print(f"{verdict} {row.case}: {measured} ({predicted}); {row.beyond}", file=sys.stderr, flush=True)
+            own = {name: getattr(row, name) for name in ("case", "predicted", "measured", "held", "beyond")}
+            self.rows.append({"part": self.part} | row.more | own)
+            self.passes.append(row.held)
+            if not (brief and row.held):
+                measured, predicted = (v if isinstance(v, str) else f"{v:.4g}" for v in (row.measured, row.predicted))
+                verdict = "passes" if row.held else "FAILS "
+                print(f"{verdict} {row.case}: {measured} ({predicted}); {row.beyond}", flush=True)
             self.write()
 
     def write(self) -> None:
         """Writes the JSON, if a file was given."""
         if self.file is not None:
-            own = ("case", "predicted", "measured", "held", "beyond")
-            rows = [{"part": self.part} | row.more | {name: getattr(row, name) for name in own} for row in self.rows]
-            report.write_report(self.file, {"meta": self.meta, "rows": rows} | self.more)
+            report.write_report(self.file, {"meta": self.meta, "rows": self.rows} | self.more)
 
-
-def table(rows: Sequence[Row]) -> str:
-    """Returns the rows as a table of at most 100 columns."""
-    lines = []
-    for row in rows:
-        measured, predicted = _figures(row)
-        lines.append((row.case, predicted, measured, "yes" if row.held else "NO", row.beyond))
-    return report.table(("case", "predicted", "measured", "passes", "details"), lines)
-
-
-def _figures(row: Row) -> tuple[str, str]:
-    measured, predicted = (v if isinstance(v, str) else f"{v:.4g}" for v in (row.measured, row.predicted))
-    return measured, predicted
+    def close(self) -> None:
+        """Writes the JSON for the last time, and prints how many rows pass."""
+        self.write()
+        print(f"{sum(self.passes)} of {len(self.passes)} rows pass")

@@ -1,12 +1,13 @@
 """The solver's figures for the gallery, on two grids, and figures of trajectories that were broken on purpose.
 
 A row passes if the solver passes on both grids and at least one broken trajectory fails. The series of all observables
-are returned for the JSON, with which networks are compared (gallery.py). Scenes that did not change since the JSON in
-results/stability was written are not simulated again: their stored series are compared with the present bounds.
+are stored in the JSON, with which networks are compared (case.py). Scenes that did not change since the JSON in
+results/stability was written are not simulated again: their stored series are compared with the present bounds. Rows
+and series of scenes that were not chosen are copied from that file.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import groupby
@@ -18,54 +19,67 @@ from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.hdf5 import damage_named
 from hgn.scene.scene import Scene
-from hgn.schema import to_mapping
+from hgn.scene.scene_file import scene_files
+from hgn.schema import require, to_mapping
 from hgn.system.machine import available_cpus
 from hgn.system.yaml_files import read_json
-from tools.report import table
 from tools.solver_rollouts import solver_trials
 from tools.stability.broken import BROKEN, FRICTIONLESS
 from tools.stability.checks import interval_text
-from tools.stability.gallery import GRID_CELLS, REFERENCE, GalleryCase, load_gallery
+from tools.stability.gallery import GALLERY, GRID_CELLS, REFERENCE, GalleryCase
 from tools.stability.observables import BoundEntry, Film, series
-from tools.stability.row import Row
+from tools.stability.row import Report, Row
 
 RATE_HZ = 60.0  # frame rate of the shipped weights
 DIGITS = 5  # significant digits of figures in the JSON
 SIMULATED = ("device", "commit", "date")  # keys of the report's meta that each scene's entry repeats
 
 
-def gallery_rows(case: str, mpm: MpmConfig, meta: dict[str, Any], scenes: dict[str, Any]) -> Iterator[Row]:
-    """Adds the series of each scene of a draw to `scenes`, and yields a row for each bound; `meta` is the report's."""
-    loaded, again = load_gallery(case), []
-    file = REFERENCE / f"{case}_solver.json"
+def gallery_rows(draw: str, chosen: Mapping[str, GalleryCase], mpm: MpmConfig, report: Report) -> Iterator[Row]:
+    """Yields a row for each bound of the chosen scenes of a draw, and adds the other scenes to the report.
+
+    Raises: ConfigError if the other scenes were simulated with other settings of the solver.
+    """
+    again: list[GalleryCase] = []
+    file, others = REFERENCE / f"{draw}_solver.json", scene_files(GALLERY).keys() - chosen.keys()
     remedy = "move it, and run python -m tools.stability solver again"
     with damage_named(f"{file} must be a report of tools.stability solver", remedy):
-        earlier = _earlier(file, mpm)
-        for each in loaded:
+        earlier = _earlier(file, mpm, others)
+        scenes = report.more["scenes"]
+        scenes |= {name: entry for name, entry in earlier["scenes"].items() if name in others}
+        report.rows += [row for row in earlier["rows"] if row.get("scene") in others]
+        broken = {row["case"]: row["broken"] for row in earlier["rows"] if "broken" in row}
+        for each in chosen.values():
             entry = earlier["scenes"].get(each.name, {"digest": None})
-            figures = [earlier["figures"].get(_name(each, bound)) for bound in each.measure.bounds]
-            if entry["digest"] != each.digest or None in figures:
+            names = [_name(each, bound) for bound in each.measure.bounds]
+            if entry["digest"] != each.digest or not broken.keys() >= {*names}:
                 again.append(each)
                 continue
-            scenes[each.name] = {"simulated": earlier["simulated"]} | entry
-            series_of = {cells: {**one} for cells, one in {**entry["series"]}.items()}
-            for index, bound in enumerate(each.measure.bounds):
-                solver = {cells: bound.reduced_line(one[bound.key]) for cells, one in series_of.items()}
-                yield _row(each, bound, solver, {k: math.nan if v is None else v for k, v in figures[index].items()})
-    for measured in _simulated(again, mpm):
-        entry, rows = measure(*measured)
-        scenes[measured[0].name] = {"simulated": {name: meta[name] for name in SIMULATED}} | entry
-        yield from rows
+            scenes[each.name] = entry
+            yield from _rows(each, entry, [broken[name] for name in names])
+    for each, films, causes, frictionless in _simulated(again, mpm):
+        entry = {"simulated": {name: report.meta[name] for name in SIMULATED}, "kind": each.measure.kind}
+        entry |= {"digest": each.digest, "series": {}, "particles": each.scenes[0].particle_count}
+        scenes[each.name] = entry
+        if causes:
+            for bound in each.measure.bounds:
+                yield Row(_name(each, bound), "simulated", "stopped", False, causes[0], {"scene": each.name})
+            continue
+        entry["series"], wrong = measure(each, films, frictionless)
+        yield from _rows(each, entry, wrong)
+    report.rows.sort(key=lambda row: row.get("scene", ""))
+    report.more["scenes"] = dict(sorted(scenes.items()))
 
 
-def _earlier(file: Path, mpm: MpmConfig) -> dict[str, Any]:
-    """Reads scenes of an earlier report, and figures of broken trajectories by row; empty if the solver's differ."""
-    report = read_json(file) if file.is_file() else {}
-    meta = report.get("meta", {})
-    if without_device(meta.get("solver", {})) != without_device(to_mapping(mpm)):
-        return {"scenes": {}, "figures": {}}
-    figures = {row["case"]: row["broken"] for row in report["rows"] if "broken" in row}
-    return {"scenes": report["scenes"], "figures": figures, "simulated": {name: meta[name] for name in SIMULATED}}
+def _earlier(file: Path, mpm: MpmConfig, others: Collection[str]) -> dict[str, Any]:
+    """Reads an earlier report; an empty one if the solver's settings were others, unless scenes are copied from it."""
+    if file.is_file():
+        report: dict[str, Any] = read_json(file)
+        if without_device(report["meta"]["solver"]) == without_device(to_mapping(mpm)):
+            return report
+        rule = f"the whole gallery where {file} has other settings of the solver"
+        require(not others, "cases", rule, f"without {', '.join(sorted(others))}")
+    return {"scenes": {}, "rows": []}
 
 
 def without_device(solver: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,13 +88,12 @@ def without_device(solver: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def measure(
-    case: GalleryCase, films: dict[int, Film], causes: Sequence[str], frictionless: Film | None
-) -> tuple[dict[str, Any], list[Row]]:
-    """Returns a scene's entry of the JSON, and its rows. The keys of `films` are cells per unit of length."""
-    entry: dict[str, Any] = {"kind": case.measure.kind, "digest": case.digest, "series": {}}
-    entry["particles"] = case.scenes[0].particle_count
-    if causes:
-        return entry, [Row(_name(case, b), "simulated", "stopped", False, causes[0]) for b in case.measure.bounds]
+    case: GalleryCase, films: dict[int, Film], frictionless: Film | None
+) -> tuple[dict[str, dict[str, str]], list[dict[str, float]]]:
+    """Returns series by grid and key, as the JSON has them, and for each bound the figures of broken trajectories.
+
+    The keys of `films` are cells per unit of length.
+    """
     bounds = {bound.key: bound for bound in case.measure.bounds}
     coarse = films[GRID_CELLS[0]]
     every = {str(cells): film for cells, film in films.items()}
@@ -93,55 +106,34 @@ def measure(
     with ThreadPoolExecutor(available_cpus()) as threads:
         values = threads.map(lambda job: series(every[job[0]], bounds[job[1]]), jobs)
         measured = dict(zip(jobs, values, strict=True))
-    grids = [str(cells) for cells in films]
     # the numbers in one line of text; in a JSON list each would take a line
-    text = {name: " ".join(f"{value:.{DIGITS}g}" for value in numbers) for name, numbers in measured.items()}
-    entry["series"] = {cells: {key: text[cells, key] for key in bounds} for cells in grids}
-    rows = []
-    for bound in case.measure.bounds:
-        figures = {name: bound.reduced(measured[name, bound.key]) for name in every}
-        own, wrong = ({k: v for k, v in figures.items() if (k in grids) == of_grid} for of_grid in (True, False))
-        rows.append(_row(case, bound, own, wrong))
-    return entry, rows
+    text = {job: " ".join(f"{value:.{DIGITS}g}" for value in numbers) for job, numbers in measured.items()}
+    solver = {str(cells): {key: text[str(cells), key] for key in bounds} for cells in films}
+    names = [name for name in every if name not in solver]
+    return solver, [_rounded({name: b.reduced(measured[name, b.key]) for name in names}) for b in case.measure.bounds]
 
 
-def _row(case: GalleryCase, bound: BoundEntry, solver: dict[str, float], broken: dict[str, float]) -> Row:
-    """Compares figures of both grids (keys: cells per unit of length) and of broken trajectories with a bound."""
-    low, high = bound.interval(solver[str(GRID_CELLS[0])])
-    failed = [name for name, figure in broken.items() if not low <= figure <= high]
-    beyond = ", ".join(f"{figure:.4g} at {cells}" for cells, figure in solver.items()) + "; fails: "
-    beyond += ", ".join(failed) or "no broken trajectory"
-    more: dict[str, Any] = {"scene": case.name, "kind": case.measure.kind, "observable": bound.of}
-    more |= _finite({"low": low, "high": high})
-    more |= {"solver": _finite(solver), "broken": _finite(broken), "caught": failed}
-    value = solver[str(GRID_CELLS[-1])]
-    held = all(low <= figure <= high for figure in solver.values()) and bool(failed)
-    shown: float | str = value if math.isfinite(value) else "none"
-    return Row(_name(case, bound), interval_text(low, high), shown, held, beyond, more)
+def _rows(case: GalleryCase, entry: Mapping[str, Any], broken: Sequence[Mapping[str, float | None]]) -> Iterator[Row]:
+    """Compares a scene's stored series of both grids, and figures of broken trajectories by bound, with its bounds."""
+    for bound, stored in zip(case.measure.bounds, broken, strict=True):
+        solver = {cells: bound.reduced_line({**one}[bound.key]) for cells, one in {**entry["series"]}.items()}
+        wrong = {name: math.nan if figure is None else figure for name, figure in stored.items()}
+        low, high = bound.interval(solver[str(GRID_CELLS[0])])
+        failed = [name for name, figure in wrong.items() if not low <= figure <= high]
+        beyond = ", ".join(f"{figure:.4g} at {cells}" for cells, figure in solver.items()) + "; "
+        figures = ", ".join(f"{name} {figure:.4g}" for name, figure in wrong.items())
+        beyond += f"fails: {', '.join(failed)}" if failed else f"no broken trajectory fails: {figures}"
+        more: dict[str, Any] = {"scene": case.name, "kind": case.measure.kind, "observable": bound.of}
+        more |= _rounded({"low": low, "high": high})
+        more |= {"solver": _rounded(solver), "broken": wrong, "caught": failed}
+        value = solver[str(GRID_CELLS[-1])]
+        held = all(low <= figure <= high for figure in solver.values()) and bool(failed)
+        shown: float | str = value if math.isfinite(value) else "none"
+        yield Row(_name(case, bound), interval_text(low, high), shown, held, beyond, more)
 
 
 def _name(case: GalleryCase, bound: BoundEntry) -> str:
     return f"{case.name}: {bound.label}"
-
-
-def broken_table(rows: Sequence[Row]) -> str:
-    """Returns a table of the rows and the figures of broken trajectories; those that fail are marked."""
-    names = (*BROKEN, FRICTIONLESS)
-    lines = []
-    for row in rows:
-        if "broken" not in row.more:
-            continue
-        wrong, caught = row.more["broken"], row.more["caught"]
-        cells = [_cell(wrong, caught, name) for name in names]
-        lines.append((row.case, row.predicted, *cells))
-    return table(("row", "bounds", *names), lines) + "\n(* fails, as it should)"
-
-
-def _cell(wrong: dict[str, float | None], caught: Sequence[str], name: str) -> str:
-    if name not in wrong:
-        return ""
-    figure = wrong[name]
-    return ("none" if figure is None else f"{figure:.3g}") + ("*" if name in caught else "")
 
 
 def _simulated(
@@ -192,5 +184,5 @@ def _film(case: GalleryCase, pairs: Sequence[tuple[Scene, RolloutResult]]) -> Fi
     return case.film(pairs[0][0], paths, RATE_HZ)
 
 
-def _finite(figures: dict[str, float]) -> dict[str, float | None]:
-    return {name: float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for name, value in figures.items()}
+def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(f"{value:.{DIGITS}g}") for name, value in figures.items()}
