@@ -14,7 +14,8 @@ from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
+from hgn.scene.scene_file import find_scene, load_scene
+from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError, FrameCount, FrameRate, from_mapping, require_bounds, require_replaceable, to_mapping
 from hgn.system.files import require_place, space_reserved
 from hgn.system.progress import advance_to, bar

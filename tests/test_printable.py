@@ -7,7 +7,8 @@ import pytest
 
 from hgn.card import _plain
 from hgn.config import NetworkConfig
-from hgn.scene.scene_file import load_scene, notes_on_files
+from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError, from_mapping, printable
 
 # control and format characters, and separators of lines, paragraphs and words

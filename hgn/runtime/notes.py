@@ -8,7 +8,7 @@ from hgn.config import SceneConfig
 from hgn.runtime.weights import WeightsInfo
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import notes_on_files
+from hgn.scene.scene_notes import notes_on_files
 
 SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; velocities are stored in float32
 

@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 
 from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
-from hgn.scene.barrier import barrier_pieces
 from hgn.scene.distance import contains, extent
 from hgn.scene.emission import Face
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
-from hgn.scene.motion import AT_REST, Motion
+from hgn.scene.motion import Motion
 from hgn.scene.particle_file import read_particles
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene, whole_cells
@@ -38,7 +37,6 @@ from hgn.schema import (
     from_mapping,
     known_keys,
     near_file,
-    printable,
     require,
     require_bounds,
     to_mapping,
@@ -268,46 +266,6 @@ def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
         return _build(from_mapping(SceneFile, content), Path(path).parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-
-
-def notes_on_files(scene: Scene) -> list[str]:
-    """Returns warnings about sheets, obstacles tiny or without a surface in the domain, and particles inside one."""
-    if scene.specification.get("kind") != "file":
-        return []
-    notes = []
-    entries = scene.specification["obstacles"]
-    for sheet in scene.obstacles[len(entries) :]:
-        notes.append(f"{len(sheet.triangle_F3)} triangles are a sheet, because they enclose no volume: {sheet.name}")
-    first = 0
-    for group, count in zip(scene.specification["groups"], scene.specification["particle_counts"], strict=False):
-        position_N3, first = scene.position_N3[first : first + count], first + count
-        if group.get("particles") is not None:
-            for obstacle in scene.obstacles:
-                if inside := int(contains(position_N3, obstacle.at(0.0)).sum()):
-                    notes.append(f"{inside} of {count} particles of {group['particles']} lie inside {obstacle.name}")
-    for entry, obstacle in zip(entries, scene.obstacles, strict=False):
-        name, key, unit = entry.get("mesh"), "scale", f" ({MILLIMETRES})"
-        if name is None:
-            name, key, unit = obstacle.name, "size", ""
-        elif not obstacle.closed:
-            remedy = "close its holes, or write bodies that touch as two obstacles"
-            notes.append(f"a sheet, not a solid, because it is not watertight: {name}; {remedy}")
-        begin = obstacle.at(0.0)
-        low_B3, high_B3 = (obstacle.motion or AT_REST).boxes(obstacle.vertex_V3)
-        around = ((low_B3 <= 0) & (high_B3 >= scene.domain_size)).all()
-        name = f"{name} ({extent(begin.vertex_V3)})"
-        if ((low_B3 > scene.domain_size) | (high_B3 < 0)).any(axis=1).all():
-            notes.append(f"outside the domain, out of reach of particles: {name}; see {key} and position")
-        elif (obstacle.motion is None or around) and not _reaches(begin, scene.domain_size, scene.cell_size):
-            notes.append(f"no surface in the domain: {name}; see {key} and position{unit}")
-        elif np.ptp(begin.vertex_V3, axis=0).max() < scene.cell_size:
-            notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name}; see {key}")
-    return [printable(note) for note in notes]
-
-
-def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
-    """Returns whether a part of an obstacle's surface lies in the domain."""
-    return len(barrier_pieces(obstacle.corners, cell_size, domain_size)) > 0
 
 
 def _build(file: SceneFile, folder: Path) -> Scene:

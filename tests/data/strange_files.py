@@ -15,7 +15,8 @@ from hgn.runtime.weights import WeightsInfo, load_weights
 from hgn.scene.mesh import load_mesh
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.scene import Obstacle
-from hgn.scene.scene_file import load_scene, notes_on_files
+from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import to_mapping
 from hgn.system.yaml_files import read_yaml
 

@@ -9,7 +9,8 @@ import trimesh
 from hgn.scene.distance import contains
 from hgn.scene.mesh import load_bodies, load_mesh
 from hgn.scene.polygons import concave_cut, fans_by_size
-from hgn.scene.scene_file import load_scene, notes_on_files
+from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -411,9 +412,8 @@ def test_each_body_is_judged_by_itself(tmp_path):
     with pytest.raises(ConfigError, match=r"must be clear of closed obstacles, got .* inside three"):
         load_scene(tmp_path / "in.yaml")
     (tmp_path / "out.yaml").write_text(group % "0.8, 0.2, 0.8")
-    assert notes_on_files(load_scene(tmp_path / "out.yaml")) == [
-        "1 triangles are a sheet, because they enclose no volume: three_sheets"
-    ]
+    note = "1 triangles are a sheet, because they enclose no volume: three_sheets"
+    assert notes_on_files(load_scene(tmp_path / "out.yaml")) == [note]
 
 
 @pytest.mark.parametrize("word", ["plain", "mark", "\r", "\r\n", " ", "\f\n", "capitals", "name", "solids", "wide"])

@@ -11,7 +11,8 @@ import trimesh
 import yaml
 
 from hgn.scene.material import SAND, SNOW, WATER
-from hgn.scene.scene_file import load_scene, notes_on_files
+from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "conf" / "example"
@@ -405,37 +406,6 @@ def test_numbers_that_are_none(tmp_path):
     text = ONE_CUBE.replace("[0.5, 0.8, 0.5]", "&middle [0.5, 0.8, 0.5]") + "obstacles:\n"
     text += "  - {shape: cone, size: 00.1, position: [0.2, 0.2, 0.2]}\nseed: 0\ngravity: [-.5, -0.98e1, +.5]\n"
     assert load_scene(write(tmp_path, text)).gravity == (-0.5, -9.8, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("scale", "note"), [(1000, "no surface in the domain"), (1, None), (1e-3, "smaller than a cell")]
-)
-def test_units_of_a_bowl(tmp_path, scale, note):
-    """A sheet around the whole domain, as a bowl in millimetres, is noted, and the scale that helps."""
-    bowl = trimesh.creation.icosphere(subdivisions=2)
-    bowl.update_faces(bowl.triangles_center[:, 1] < 0.5)
-    bowl.apply_scale(0.3 * scale)
-    bowl.export(tmp_path / "bowl.obj")
-    text = ONE_CUBE + "obstacles: [{mesh: bowl.obj, position: [0.5, 0.4, 0.5]}]\n"
-    notes = notes_on_files(load_scene(write(tmp_path, text)))
-    assert len(notes) == 1 + (note is not None) and (note is None or note in notes[1])
-
-
-@pytest.mark.parametrize("inside", [0, 1, 7])
-def test_stored_particles_inside_an_obstacle(tmp_path, inside):
-    """They are noted with their number, for obstacles of any kind; an empty file is refused."""
-    position_N3 = np.full((20, 3), 0.8, np.float32)
-    position_N3[:inside] = (0.5, 0.3, 0.5)
-    np.savez(tmp_path / "stored.npz", position=position_N3)
-    trimesh.creation.box(extents=(0.3, 0.3, 0.3)).export(tmp_path / "box.ply")
-    told = [f"{inside} of 20 particles of stored.npz"] * (inside > 0)
-    for kind in ({"shape": "cone", "size": 0.3}, {"mesh": "box.ply"}):
-        obstacles = [kind | {"position": [0.5, 0.3, 0.5]}]
-        scene = load(tmp_path, groups=[{"particles": "stored.npz", "material": "sand"}], obstacles=obstacles)
-        assert [note.partition(" lie")[0] for note in notes_on_files(scene)] == told
-    np.savez(tmp_path / "stored.npz", position=position_N3[:0])
-    with pytest.raises(ConfigError, match="position must be of at least one particle"):
-        load_scene(tmp_path / "scene.yaml")
 
 
 def test_a_mistyped_file_name_is_answered_with_the_file(tmp_path):

@@ -8,7 +8,8 @@ import trimesh
 
 from hgn.config import OBSTACLE_SHAPES
 from hgn.scene.rotation import euler_rotation, quaternion_product, quaternion_rotation
-from hgn.scene.scene_file import load_scene, notes_on_files
+from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_notes import notes_on_files
 from hgn.scene.shapes import CLOSED_SHAPES, shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError
