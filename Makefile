@@ -43,7 +43,7 @@ demo: $(VENV)/.demo
 	@echo "== 2 of 4: exporting inference weights"
 	$(RUN) -m hgn.export checkpoint=$(DEMO)/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
 	@echo "== 3 of 4: simulating a validation scene, and drawing it with its ground truth"
-	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 frames=40 out=$(DEMO)/rollout.vtkhdf
+	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 frames=40 render=false out=$(DEMO)/rollout.vtkhdf
 	$(RUN) -m tools.render rollout=$(DEMO)/rollout.vtkhdf out=$(DEMO)/pictures every=2
 	@echo "== 4 of 4: errors"
 	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=data/demo json=$(DEMO)/errors.json
