@@ -138,8 +138,9 @@ def draw(runs: Sequence[Run]) -> bytes:
     if len(runs) == 1:
         _draw_one(panels, runs[0], last)
         training, dataset = runs[0].settings["training"], runs[0].settings["dataset"]
-        episodes = f"{last['episodes']:.0f} training episodes, " if "episodes" in last else ""
-        title = f"{dataset['folder']}, {episodes}{training['batch_scenes']} scenes an update, {title}"
+        scenes, count = training["batch_scenes"], last.get("episodes")
+        episodes = "" if count is None else f"{count:.0f} training episode{'s' * (count != 1)}, "
+        title = f"{dataset['folder']}, {episodes}{scenes} scene{'s' * (scenes > 1)} an update, {title}"
     else:
         _draw_several(panels, runs, last)
     panels[0].set_ylabel(LOSS)

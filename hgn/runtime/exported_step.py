@@ -11,6 +11,7 @@ rest shape (0, or N), B rest neighbours, V moving obstacles, T frames.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import warnings
 from dataclasses import replace
@@ -53,6 +54,10 @@ OWN_INPUTS = {
 }  # the inputs that follow for each of `network.own_physics`; those of `moving` only in graphs with moving obstacles
 MOST_POSES = 100_000  # largest number of frames times obstacles in `moving_pose` of `initial_arrays`
 OUTPUTS = ("next_position", "next_velocity")
+# torch registers the ONNX forms of torchvision's operators in each export, which no graph of this package contains
+logging.getLogger("torch.onnx._internal.exporter._registration").addFilter(
+    lambda record: record.msg != "torchvision is not installed. Skipping %s"
+)
 # sizes for tracing; the graph does not depend on them
 EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES, EXAMPLE_RESTS = 64, 32, 16, 8
 

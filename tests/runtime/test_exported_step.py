@@ -159,6 +159,15 @@ def as_onnx(request, tmp_path_factory):
     return exported(tmp_path_factory.mktemp("onnx"), ("onnx",), WALLED | {"levels": 2})
 
 
+def test_operators_of_torchvision_are_not_missed(caplog):
+    """PyTorch warns of each operator of a package that no step needs; its other warnings are printed."""
+    from torch.onnx._internal.exporter._registration import ONNXRegistry, logger
+
+    ONNXRegistry.from_torchlib()
+    logger.warning("another")
+    assert caplog.messages == ["another"]
+
+
 def test_onnx_is_the_step(as_onnx):
     """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles, which hold some of
     them; the file says what its weights say of themselves; the example in Python simulates a scene's arrays."""

@@ -111,7 +111,7 @@ def test_pipes_are_refused(tmp_path, name):
         read_run(tmp_path / "run")
 
 
-@pytest.mark.parametrize("episodes", [3, math.nan, math.inf])
+@pytest.mark.parametrize("episodes", [1, 3, math.nan, math.inf])
 @pytest.mark.parametrize("name", [r"$\frac{$", r"\$\frac$ $", "\ud800", "a\0", "$a$"])
 def test_odd_texts_and_counts_are_drawn(tmp_path, monkeypatch, name, episodes):
     """Names with dollar signs are no formulas. The picture of a number of episodes that is none exists too."""
@@ -121,10 +121,12 @@ def test_odd_texts_and_counts_are_drawn(tmp_path, monkeypatch, name, episodes):
         RendererAgg, "draw_text", lambda self, *given, **more: (drawn.add(given[3]), draw_text(self, *given, **more))
     )
     run = read_run(make_run(tmp_path / "run"))
-    odd = replace(run, name=name, settings=run.settings | {"dataset": {"folder": name}})
+    one = {"training": run.settings["training"] | {"batch_scenes": 1}}
+    odd = replace(run, name=name, settings=run.settings | {"dataset": {"folder": name}} | one)
     odd.records[-1]["episodes"] = episodes
     shown = printable(name)
     draw([odd])
-    assert any(text.startswith(f"{shown}, {episodes} training episodes, 2 scenes") for text in drawn)
+    title = f"{shown}, {episodes} training episode{'s' * (episodes != 1)}, 1 scene an update, "
+    assert any(text.startswith(title) for text in drawn)
     draw([odd, run])
     assert shown in drawn
