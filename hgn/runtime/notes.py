@@ -22,7 +22,7 @@ def notes_on_scene(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[st
         yield f"no effect: {unused} of groups; {weights} simulates each material with the solver's constants"
     frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
     if frictions.any() and "friction" not in inputs:
-        yield f"no effect: friction of surfaces; {weights} has that of its data, and own_physics has it as input"
+        yield f"no effect: friction of surfaces; {weights} simulates that of its data, own_physics the scene's"
     density, common = scene.particles_per_cell, SceneConfig.particles_per_cell
     if density not in (None, common):
         yield f"particles_per_cell: {density:g}, shipped weights were trained with {common:g}; motion is unreliable"

@@ -133,7 +133,7 @@ def test_the_page_says_what_weights_do_not_know(tmp_path, capsys, monkeypatch):
     (tmp_path / "rough.yaml").write_text(f"floor_friction: 0.6\ngroups: [{group}]\n")
     play.play_page(play.PlayConfig(scene=str(tmp_path / "rough.yaml"), weights="obstacles_small", device="cpu"))
     said = capsys.readouterr().err
-    assert "no effect: friction of surfaces; obstacles_small has that of its data" in said
+    assert "no effect: friction of surfaces; obstacles_small simulates that of its data" in said
     assert "velocity: groups start with up to 2.7 domain units per second, in the data of obstacles_small" in said
 
 

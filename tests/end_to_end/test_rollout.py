@@ -116,7 +116,7 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     said = capsys.readouterr().err
     assert "no effect: youngs_modulus_pa of groups; still simulates each material with the solver's" in said
     assert "a sheet, not a solid, because it is not watertight: open.obj; close its" in said and "square" not in said
-    assert "no effect: friction of surfaces; still has that of its data, and own_physics has it as input" in said
+    assert "no effect: friction of surfaces; still simulates that of its data, own_physics the scene's" in said
     assert "particles_per_cell: 4, shipped weights were trained with 8; motion is unreliable" in said
     assert said.count("outside the domain, out of reach of particles: open.obj (x 540 to 580, y 40 to 40") == 1
     assert said.endswith(f"\nrender=true also draws it, or python -m tools.render rollout={out} out=pictures\n")
