@@ -218,16 +218,22 @@ class LogLines(Callback):
 
 
 class Stopper(Callback):
-    """Ends the loop on every rank between two chunks, after a checkpoint."""
+    """Ends the loop on every rank between two chunks, after a checkpoint.
 
-    AGREE_EVERY = 10  # number of updates between two exchanges of stop requests among ranks
+    Ranks exchange stop requests, and the time of an update since the last exchange. All ranks derive the update of the
+    next exchange from the longest of these times.
+    """
+
+    AGREE_S = 1.0  # seconds between two exchanges, or one update if that takes longer
+    AGREE_EVERY = 10  # largest number of updates between two exchanges
 
     def __init__(self, stop: StopRequest, checkpoints: Checkpoints) -> None:
         self.stop, self.checkpoints = stop, checkpoints
-        self._agreed_update = 0
+        self._agreed, self._due_update = (0, 0.0), self.AGREE_EVERY
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._agreed_update = _update(pl_module)
+        self._agreed = _update(pl_module), time.monotonic()
+        self._due_update = _update(pl_module) + 1
         # Lightning has just replaced our SIGTERM handler by one that would communicate with the other ranks, and leave
         # the loop by an exception without a checkpoint.
         self.stop.listen()
@@ -235,18 +241,24 @@ class Stopper(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
+        if trainer.world_size == 1:
+            trainer.should_stop |= self.stop.requested
+            return
         update = pl_module.update
         # A stop request that ended a measurement must end the training before the next update.
-        due = update >= self._agreed_update + self.AGREE_EVERY or measurement_due(pl_module.training_config, update)
-        if trainer.world_size > 1 and not due:
+        if update < self._due_update and not measurement_due(pl_module.training_config, update):
             return
-        self._agreed_update = update
-        if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
+        # 0: no request, 1: one without a signal. All ranks end with the same exit code, whatever signals they received.
+        mine = 2 + BY_WEIGHT.index(self.stop.signal) if self.stop.signal is not None else int(self.stop.requested)
+        agreed_update, agreed_s = self._agreed
+        self._agreed = update, time.monotonic()
+        values = torch.tensor([mine, (self._agreed[1] - agreed_s) / (update - agreed_update)], device=pl_module.device)
+        request, update_s = trainer.strategy.reduce(values, reduce_op="max").tolist()
+        every = int(min(self.AGREE_EVERY, max(1.0, self.AGREE_S / max(update_s, 1e-6))))
+        self._due_update = (update // every + 1) * every
+        if request:
             trainer.should_stop = True
-            # Ranks may have received different signals or none. All ranks end with the same exit code.
-            mine = 0 if self.stop.signal is None else 1 + BY_WEIGHT.index(self.stop.signal)
-            heaviest = int(trainer.strategy.reduce(torch.tensor(mine, device=pl_module.device), reduce_op="max"))
-            self.stop.signal = int(BY_WEIGHT[heaviest - 1]) if heaviest else None
+            self.stop.signal = int(BY_WEIGHT[int(request) - 2]) if request > 1 else None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.checkpoints.finish(trainer, _update(pl_module))

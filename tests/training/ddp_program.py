@@ -4,20 +4,27 @@ Trains as FOLDER/mapping.json says. FOLDER/faults.json holds [restart, rank, upd
 that rank sends a signal (its number) at that update to itself (target self) or to torchrun (launcher), meets an error
 of its own ("error"), misses its data ("storage"), or gets other weights ("weights"). FOLDER/stopped_RANK is the process
 that a SIGSTOP stops. FOLDER/watch.json, where it is, has constants of hgn.training.watch.
+Ranks exchange stop requests at every tenth update, or as FOLDER/clock.json says, the seconds from one look of a rank's
+stopper at its clock to the next.
 Keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update, FOLDER/end_RANK.pt with the weights, the update
 and the exit code, FOLDER/starts_RANK with the update of each start, FOLDER/talk_RANK.json with the updates at which
 ranks talked of anything but gradients, FOLDER/recorder_RANK.json with the flight recorder's variables as ranks met.
 """
 
 import json
+import math
 import os
 import signal
 import sys
+import time
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 
+import hgn.training.callbacks
 import hgn.training.watch
 from hgn import train
 from hgn.data.storage import StorageError
@@ -33,6 +40,12 @@ def main(folder):
     if (folder / "watch.json").exists():
         for name, seconds in ({"BEAT_S": 0.2} | json.loads((folder / "watch.json").read_text())).items():
             setattr(hgn.training.watch, name, seconds)
+    hgn.training.callbacks.Stopper.AGREE_S = math.inf
+    if (folder / "clock.json").exists():
+        hgn.training.callbacks.Stopper.AGREE_S = 1.0
+        times = count(0, json.loads((folder / "clock.json").read_text())[rank])
+        clock: Any = SimpleNamespace(monotonic=lambda: next(times), time=time.time)
+        hgn.training.callbacks.time = clock
     rows = json.loads((folder / "faults.json").read_text())
     faults = {update: rest for in_start, of_rank, update, *rest in rows if (in_start, of_rank) == (restart, rank)}
     end: dict[str, Any] = {}

@@ -260,7 +260,6 @@ def test_a_signal_ends_simulations_before_an_update(data, tmp_path, monkeypatch,
 def test_ranks_stop_before_the_next_update_after_a_stopped_measurement():
     """Otherwise the checkpoint would be of a later update, and the measurement would be lost."""
     stop, trainer = StopRequest(), mock.Mock(world_size=2, should_stop=False)
-    trainer.strategy.reduce_boolean_decision = lambda mine, all: mine
     trainer.strategy.reduce = lambda mine, reduce_op: mine
     stop.signal = signal.SIGTERM
     module = mock.Mock(spec=TrainingModule, training_config=TrainingConfig(**TRAINING), device=torch.device("cpu"))
