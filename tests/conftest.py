@@ -5,6 +5,7 @@ import gc
 import importlib.util
 import io
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -186,3 +187,11 @@ def folder(data):
 def warm_python():
     """An interpreter that has the training stack loaded, see warm_server.py."""
     return Path(os.environ[warm_server.VARIABLE]) / "python"
+
+
+@pytest.fixture
+def file_limit():
+    """Sets the largest size of a file in bytes; None: none."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (before[0] if size is None else size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -5,6 +5,9 @@ water as a closed surface. USD and surfaces need the extra `files` (usd-core, py
 Shape legend: T frames, N particles, V vertices, F triangles.
 """
 
+import errno
+import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -58,7 +61,13 @@ def save_rollout(
         if path.suffix == PLY_ENDING:
             _write_ply(partial, rollout, surface, progress)
         else:
-            _write_usd(partial, rollout, surface, progress)
+            from pxr import Tf
+
+            try:
+                _write_usd(partial, rollout, surface, progress)
+            except Tf.ErrorException as error:  # of many lines, without the number of the system's error
+                code = errno.ENOSPC if shutil.disk_usage(folder).free < 1 << 20 else errno.EIO
+                raise OSError(code, os.strerror(code), str(path)) from error
         for file in Path(folder).iterdir():
             sync_written(file)
         written = [file.replace(path.parent / file.name) for file in sorted(Path(folder).iterdir())]

@@ -1,12 +1,17 @@
-"""Reads untrusted HDF5 files: links to other files are refused, and damage results in one message."""
+"""Reads untrusted HDF5 files: links to other files are refused, and damage results in one message.
+
+Writes files on disks that fail: HDF5 loses refused data without an error or ends the process.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hgn.schema import ConfigError
 from hgn.system.claims import Claims
@@ -32,6 +37,45 @@ def damage_named(rule: str, remedy: str) -> Iterator[None]:
         raise
     except _DAMAGE as error:
         raise ConfigError(f"{rule}, got {' '.join(str(error).split())}; {remedy}") from error
+
+
+class FileOnDisk(io.FileIO):
+    """A new file for h5py that keeps what the disk refuses, until `settle` has written it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "xb+")
+        self._waiting: list[tuple[int, bytes | None]] = []  # places with their content, or the end without one
+
+    def write(self, data: Any) -> int:
+        content = bytes(data)
+        self._attempt(self.tell(), content)
+        self.seek(len(content), os.SEEK_CUR)
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        end = self.tell() if size is None else size
+        self._attempt(end, None)
+        return end
+
+    def readinto(self, buffer: Any) -> Any:
+        self.settle()
+        return super().readinto(buffer)
+
+    def _attempt(self, place: int, content: bytes | None) -> None:
+        self._waiting.append((place, content))
+        with contextlib.suppress(OSError):  # raised by the caller's `settle`
+            self.settle()
+
+    def settle(self) -> None:
+        """Writes what waits. Raises: OSError of the disk; a later call tries again."""
+        while self._waiting:
+            place, content = self._waiting[0]
+            if content is None:
+                os.ftruncate(self.fileno(), place)
+            elif (count := os.pwrite(self.fileno(), content, place)) < len(content):
+                self._waiting[0] = place + count, content[count:]
+                continue
+            del self._waiting[0]
 
 
 def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from hgn.scene.hdf5 import damage_named, open_hdf5
+from hgn.scene.hdf5 import FileOnDisk, damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
@@ -200,8 +200,10 @@ def _growing_file(path: Path, rollout: Rollout) -> Iterator[_GrowingFile]:
     import h5py
 
     with temporary_file(path) as temporary:
-        with h5py.File(temporary, "x", locking=False) as file:
-            yield _GrowingFile(file, rollout)
+        with FileOnDisk(temporary) as disk:
+            with h5py.File(disk, "w") as file:
+                yield _GrowingFile(file, rollout, disk.settle)
+            disk.settle()
         sync_written(temporary)
         temporary.replace(path)
     sync_folder(path.parent)
@@ -216,7 +218,7 @@ def read_rollout(path: str | Path) -> Rollout:
     if not path.is_file():
         raise ConfigError(f"rollout must be an existing file, got {path}; python -m hgn.rollout writes one")
     rule, remedy = f"{path}: rollout must be a complete HDF5 file", "write it again"
-    with open_hdf5(path, rule, remedy) as file, damage_named(rule, remedy):
+    with damage_named(rule, remedy), open_hdf5(path, rule, remedy) as file:
         _check_format(file, path)
         try:
             return _read(file, Claims(path))
@@ -227,8 +229,9 @@ def read_rollout(path: str | Path) -> Rollout:
 class _GrowingFile:
     """A file with the first frames of a rollout. Each dataset with a row or rows for each frame grows."""
 
-    def __init__(self, file: h5py.File, rollout: Rollout) -> None:
+    def __init__(self, file: h5py.File, rollout: Rollout, settle: Callable[[], None]) -> None:
         self._file, self._group, self._rollout = file, file.create_group("VTKHDF"), rollout
+        self._settle = settle
         self.count, self.written_s = 0, time.monotonic()
         _write_topology(self._group, rollout)
         _write_own(file.create_group("hgn"), rollout)
@@ -255,6 +258,7 @@ class _GrowingFile:
             _extend(self._group, name, value_T[begin:], begin, FRAMES_OF_A_CHUNK)
         self._group["Steps"].attrs["NSteps"] = np.int64(end)
         self._file.flush()
+        self._settle()
         self.count, self.written_s = end, time.monotonic()
 
 

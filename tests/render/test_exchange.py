@@ -42,6 +42,15 @@ def rollout():
     return Rollout(start_N3 + motion_T13, material_N, obstacles, (1.0, 1.0, 1.0), 60.0)
 
 
+@pytest.mark.parametrize("ending", ["usda", "usdc", "ply"])
+def test_a_disk_that_fails(tmp_path, rollout, file_limit, ending):
+    """The error is the system's, with the file that was to be written, and no part of it is left."""
+    file_limit(1000)
+    with pytest.raises(OSError, match=r"Input/output error: .*scene\.usd|File too large") as fault:
+        save_rollout(tmp_path / f"scene.{ending}", rollout)
+    assert "\n" not in str(fault.value) and not list(tmp_path.iterdir())
+
+
 def meshes_of(stage):
     return [UsdGeom.Mesh(prim) for prim in stage.GetPrimAtPath("/World/obstacles").GetChildren()]
 

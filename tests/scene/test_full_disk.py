@@ -1,0 +1,36 @@
+"""Rollouts on a disk that refuses data for a while or for good; a limit on the size of files stands in for it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scene.test_rollout_file import contents, growing
+
+from hgn.scene import rollout_file
+from hgn.scene.rollout_file import write_frames, write_rollout
+
+
+@pytest.mark.parametrize("size", [0, 5000, 40_000])
+@pytest.mark.parametrize("refused", [1, 2, 5])
+@pytest.mark.parametrize("lasting", [False, True])
+def test_refused_data(tmp_path, monkeypatch, file_limit, refused, size, lasting):
+    """Data that the disk refuses for a while are written later, and else the file of before stays. HDF5 lost such data
+    without an error, or ended the process."""
+    monkeypatch.setattr(rollout_file, "WRITE_EVERY_S", -1.0)
+    whole, path, take_frames = growing(), tmp_path / "a.vtkhdf", rollout_file.take_frames
+    write_rollout(path, dataclasses.replace(whole, position_TN3=whole.position_TN3[: refused + 1]))
+    expected = contents(path)
+    if not lasting:
+        path.unlink()
+        monkeypatch.setattr(rollout_file, "take_frames", lambda *rest: (take_frames(*rest), file_limit(None))[0])
+
+    def frames():
+        for frame, position_N3 in enumerate(whole.position_TN3):
+            if frame == refused:
+                file_limit(size)
+            yield position_N3[: whole.present(frame)]
+
+    with pytest.raises(OSError, match="File too large"):
+        write_frames(path, dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan)), frames())
+    np.testing.assert_equal(contents(path), expected)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.vtkhdf"]
