@@ -41,7 +41,7 @@ class AverageConfig:
         if self.coefficients is not None:
             count = f"one for each of the {len(self.weights)} files"
             require(len(self.coefficients) == len(self.weights), "coefficients", count, len(self.coefficients))
-            require(abs(sum(self.coefficients) - 1) < 1e-6, "coefficients", "1 together", sum(self.coefficients))
+            require(abs(sum(self.coefficients) - 1) < 1e-6, "coefficients", "numbers of sum 1", sum(self.coefficients))
 
 
 def main(mapping: dict[str, Any]) -> int:

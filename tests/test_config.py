@@ -104,7 +104,7 @@ RULES = {
         ({"colliding_scene_fraction": 0.1}, "maximum_initial_speed must be above 0 if colliding_.* is, got 0.0"),
     ],
     kinds_of: [
-        ({"lake": 1.0}, "kinds must be of obstacles, motion"),
+        ({"lake": 1.0}, "kinds must be among obstacles, motion"),
         ({"pool": -1.0}, "kinds.pool must be a finite number >= 0, got -1.0"),
         ({"pool": 0.0}, "kinds must be numbers with at least one above 0"),
         ({"pool": 1.0, "group_count": 2}, r"group_count must be its default \(4\) if kinds"),
@@ -119,7 +119,7 @@ RULES = {
     average_of: [
         ({"count": 1}, "weights must be at least two files, got 1"),
         ({"count": 2, "coefficients": (0.5, 0.3, 0.2)}, "coefficients must be one for each of the 2 files, got 3"),
-        ({"count": 2, "coefficients": (0.7, 0.4)}, "coefficients must be 1 together, got 1.1"),
+        ({"count": 2, "coefficients": (0.7, 0.4)}, "coefficients must be numbers of sum 1, got 1.1"),
     ],
     command(BenchConfig): [
         ({"cases": ["frames"]}, r"cases\[0\] must be one of frame, torch_frame"),

@@ -97,7 +97,7 @@ class Manifest(_Identity):
         head = from_mapping(_Head, mapping, path)
         shards = Index(folder, head.index, no_totals() | head.totals)
         for name, splits in (("requested", head.requested), ("totals", shards.totals)):
-            require(set(splits) <= set(SPLITS), f"{path}.{name}", f"of {', '.join(SPLITS)}", sorted(splits))
+            require(set(splits) <= set(SPLITS), f"{path}.{name}", f"for {', '.join(SPLITS)}", sorted(splits))
         for totals in shards.totals.values():
             require_sound(totals.statistics or Statistics())
         count = sum(totals.shards for totals in shards.totals.values())

@@ -215,7 +215,7 @@ def _moving_arrays(moving: MovingObstacles) -> dict[str, np.ndarray]:
     """
     own = moving.scenes[0]
     frames = math.ceil(max(m.motion.time_T[-1] for m in own) / moving.frame_s) + 2
-    rule = f"of at most {MOST_POSES} poses, frames times obstacles, with arrays"
+    rule = f"at most {MOST_POSES} poses (frames times obstacles) with arrays"
     require(frames * len(own) <= MOST_POSES, "keyframes", rule, frames * len(own))
     triangles = [barrier_pieces(m.corner_F33, moving.cell_size) for m in own]
     poses = [[np.column_stack(m.motion.transform(t * moving.frame_s)) for m in own] for t in range(frames)]

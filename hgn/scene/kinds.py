@@ -67,7 +67,7 @@ def fastest(scene: Any) -> float:
 def require_kinds(scene: Any) -> None:
     """Checks the kinds of a SceneConfig, and that the settings which kinds draw are defaults. Raises: ConfigError."""
     for kind, share in scene.kinds.items():
-        require(kind in SCENE_KINDS, "kinds", f"of {', '.join(SCENE_KINDS)}", kind)
+        require(kind in SCENE_KINDS, "kinds", f"among {', '.join(SCENE_KINDS)}", kind)
         require(0 <= share < math.inf, f"kinds.{kind}", "a finite number >= 0", share)
     if not scene.kinds:
         return

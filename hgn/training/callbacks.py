@@ -199,7 +199,7 @@ class LogLines(Callback):
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
 
     def _estimate(self, module: TrainingModule, progress: tqdm[Any]) -> None:
-        """Prints once, after the first seconds of updates, how long the other updates will take."""
+        """Prints once, after the first seconds of updates, how long the remaining updates will take."""
         now, update = time.monotonic(), module.update
         self._first = self._first or (now, update)  # not timed, because it compiles kernels
         seconds, updates = now - self._first[0], update - self._first[1]
@@ -207,7 +207,7 @@ class LogLines(Callback):
         if self._estimated or self.feed.interrupted() or updates < 2 or min(seconds, left_s) < ESTIMATE_AFTER_S:
             return
         self._estimated = True
-        text = f"about {duration(left_s)} for the other updates, at {updates / seconds:.2g} a second"
+        text = f"about {duration(left_s)} for the remaining updates, at {updates / seconds:.2g} per second"
         if module.device.type == "cpu" and left_s > LONG_ON_A_CPU_S:
             text += f"; {WAY_OUT}"
         progress.write(text, file=sys.stderr)

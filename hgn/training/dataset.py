@@ -67,19 +67,19 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     require("imported" not in stored and not config.imported, field, "left out for imported data", folder)
     scene = from_stored(SceneConfig, stored["scene"], "scene")
     rate = config.dataset.frame_rate_hz
-    require(stored["frame_rate_hz"] == rate, field, f"of {rate:g} frames a second", stored["frame_rate_hz"])
+    require(stored["frame_rate_hz"] == rate, field, f"data with {rate:g} frames per second", stored["frame_rate_hz"])
     cell_size = config.scene.cell_size
-    require(scene.cell_size == cell_size, field, f"of solver cells of {cell_size:g}", scene.cell_size)
+    require(scene.cell_size == cell_size, field, f"data with cells of {cell_size:g}", scene.cell_size)
     known_materials = set(scene.materials) <= set(network.materials)
-    require(known_materials, field, f"of the materials {', '.join(network.materials)}", list(scene.materials))
+    require(known_materials, field, f"data with only {', '.join(network.materials)}", list(scene.materials))
     seen = network.obstacle_features or scene.obstacle_count == 0
-    require(seen, field, "without obstacles, which the network does not see", folder)
+    require(seen, field, "data without obstacles, which the network does not see", folder)
     upright = scene.gravity == config.scene.gravity and scene.upright
-    require(network.relative or upright, field, "of dataset's gravity with network.inputs=absolute", folder)
+    require(network.relative or upright, field, "data with the settings' gravity if network.inputs=absolute", folder)
     differences = identity_differences(stored["mpm"], physics_settings(config.datagen), "mpm")
-    require(not differences, field, "of the same physics", f"{folder}, where {'; '.join(differences[:3])}")
+    require(not differences, field, "data with the same mpm settings", f"{folder}, where {'; '.join(differences[:3])}")
     reference, own = stored.get("reference"), config.datagen.reference
-    require(reference == own, field, f"of the same reference grid ({own or 'the visible one'})", reference)
+    require(reference == own, field, f"data with the same reference grid ({own or 'none'})", reference)
 
 
 def wait_for_episodes(

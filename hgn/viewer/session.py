@@ -330,7 +330,7 @@ class PlaySession:
         Raises ConfigError for weights that do not support the scene, or that have another frame rate.
         """
         rate = self.simulator.frame_rate_hz
-        require(simulator.frame_rate_hz == rate, "weights", f"of {rate} frames a second", simulator.frame_rate_hz)
+        require(simulator.frame_rate_hz == rate, "weights", f"for {rate} frames per second", simulator.frame_rate_hz)
         newest, history_NM3 = self.newest, self.recording.history(self.frame)
         first, count = self.live.scenes[0], len(newest.position_N3)
         known, bodies = first.parameters, first.body_N

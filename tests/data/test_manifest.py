@@ -92,7 +92,7 @@ FAULTS = [  # the place in a manifest or in a line of its index, its value, the 
         for key in ("frames", "long_frames")
         for value in ("x", [6], None, 6.0, 0)
     ),
-    ("requested.dev", 1, "requested must be of train, validation, test"),
+    ("requested.dev", 1, "requested must be for train, validation, test"),
     ("index", None, r"index must be given, got None; release 0\.1\.0 listed the shards here"),
     ("shards.0.bytes", None, r"jsonl\.bytes must be a whole number"),
     ("shards.0.bytes", -1, r"jsonl\.bytes must be a finite number >= 0"),

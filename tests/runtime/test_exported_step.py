@@ -306,7 +306,7 @@ def test_poses_of_a_motion_without_end(tmp_path, obstacles, last_s, poses):
     options = {"weights": str(tmp_path / "w.safetensors"), "arrays": str(tmp_path / "arrays"), "scene": str(scene)}
     with pytest.raises(
         ConfigError,
-        match=f"keyframes must be of at most 100000 poses, frames times obstacles, with arrays, got {poses}",
+        match=rf"keyframes must be at most 100000 poses \(frames times obstacles\) with arrays, got {poses}",
     ):
         export.main(options)
     assert not (tmp_path / "arrays").exists()

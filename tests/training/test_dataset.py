@@ -64,7 +64,7 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     bars[0].close()
     assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [3]
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
-    assert "for the other updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
+    assert "for the remaining updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
 
 
 @pytest.mark.parametrize(("update", "printed"), [(5, True), (11, False)])

@@ -170,7 +170,7 @@ def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
 )
 def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, capsys, number, place, updates):
     """A real signal in the middle of an update, or before the first, ends the run at that update, with a checkpoint and
-    128 + its number. The time of the other updates is not estimated then."""
+    128 + its number. The time of the remaining updates is not estimated then."""
     original = getattr(*place)
     monkeypatch.setattr(callbacks, "ESTIMATE_AFTER_S", 0.0)
 
@@ -181,7 +181,7 @@ def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, capsys, 
 
     monkeypatch.setattr(*place, signalled)
     assert train.main(train_mapping(data, run)) == 128 + number
-    assert "for the other updates" not in capsys.readouterr().err
+    assert "for the remaining updates" not in capsys.readouterr().err
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == updates
 
 
@@ -313,10 +313,10 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         ({}, {"more_data": ["nowhere"]}, r"nowhere/manifest\.json must be the manifest of a data set"),
         ({}, {"more_data": ["DATA"]}, r"more_data\[0\] must be a data set that is not among the others"),
         ({"dataset": {"training_scenes": 0}}, {}, r"more_data\[0\] must be a data set with training episodes"),
-        ({"dataset": {"frame_rate_hz": 30.0}}, {}, r"more_data\[0\] must be of 60 frames a second, got 30"),
-        ({"scene": {"cell_size": 1 / 32}}, {}, r"more_data\[0\] must be of solver cells of 0.015625, got 0.03125"),
-        ({"scene": {"gravity": (0.0, -1.0, 0.0)}}, {}, r"more_data\[0\] must be of dataset's gravity with"),
-        ({"mpm": {"poisson_ratio": 0.3}}, {}, r"must be of the same physics, got .*mpm.poisson_ratio is 0.3 there"),
+        ({"dataset": {"frame_rate_hz": 30.0}}, {}, r"more_data\[0\] must be data with 60 frames per second, got 30"),
+        ({"scene": {"cell_size": 1 / 32}}, {}, r"more_data\[0\] must be data with cells of 0.015625, got 0.03125"),
+        ({"scene": {"gravity": (0.0, -1.0, 0.0)}}, {}, r"more_data\[0\] must be data with the settings' gravity if"),
+        ({"mpm": {"poisson_ratio": 0.3}}, {}, r"data with the same mpm settings, got .*mpm.poisson_ratio is 0.3 there"),
     ],
 )
 def test_data_that_do_not_go_together(data, make_config, make_dataset, tmp_path, changes, training, message):

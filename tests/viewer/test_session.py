@@ -354,7 +354,7 @@ def test_other_weights_go_on_from_here(session):
     does not fit is refused and nothing changes. A history of another length begins with the last displacement."""
     steps(session, 3)
     state = session.live.state
-    with pytest.raises(ConfigError, match=r"weights must be of 60.0 frames a second, got 30.0"):
+    with pytest.raises(ConfigError, match=r"weights must be for 60.0 frames per second, got 30.0"):
         session.use_weights(Simulator(network_of(torch.float32), 30.0))
     with pytest.raises(ConfigError, match=r"material must be one of the network's \(sand\), got water"):
         session.use_weights(Simulator(network_of(torch.float32, materials=("sand",)), 60.0))
