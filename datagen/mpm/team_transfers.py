@@ -158,14 +158,18 @@ def scatter(
             bits = 0
             if ti.static(bool(arrays.variant & VARIANT.sheets)):
                 bits = arrays.hidden[share.first + p]
-            for i, j in ti.static(ti.ndrange(3, 3)):
-                weight_xy = w[i][0] * w[j][1]
-                v_xy = v + A[0] * i + A[1] * j
-                for k in ti.static(range(3)):
-                    given = weight_xy * w[k][2] * (v_xy + A[2] * k)
-                    if ti.static(bool(arrays.variant & VARIANT.sheets)):
-                        given = 0.0 if (bits >> (9 * i + 3 * j + k)) & 1 else given
-                    gain[9 * i + 3 * j + k] += given
+            for i in ti.static(range(3)):
+                weight = ti.Vector([w[i][0] * w[j][1] * w[k][2] for j in range(3) for k in range(3)])
+                if ti.static(bool(arrays.variant & VARIANT.sheets)):
+                    hidden = bits >> 9 * i & 511
+                    if hidden != 0:  # most particles see all nodes
+                        for n in ti.static(range(9)):
+                            weight[n] = 0.0 if hidden >> n & 1 else weight[n]
+                v_x = v + A[0] * i if i > 0 else v
+                for j in ti.static(range(3)):
+                    v_xy = v_x + A[1] * j if j > 0 else v_x
+                    for k in ti.static(range(3)):
+                        gain[9 * i + 3 * j + k] += weight[3 * j + k] * (v_xy + A[2] * k if k > 0 else v_xy)
             if ti.static(bool(arrays.variant & VARIANT.sheets)):
                 n = 0
                 while bits != 0:

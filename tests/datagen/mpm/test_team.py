@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 import shared_kernels
-from mpm_scenes import CELL, CONFIG, assert_inside, block, particles, sheet, simulated
+from mpm_scenes import CELL, CONFIG, assert_inside, block, joined, particles, sheet, simulated
 
 from datagen.mpm import solver, team_launch
 from datagen.mpm.device import Device
@@ -36,11 +36,15 @@ def two_threads():
 HEAVY = mixed(90, 1, (1, -1, 0), material_parameters={"density_kg_m3": np.linspace(500, 2000, 90, dtype=np.float32)})
 
 
+ABOVE = block(np.arange(20) % 4, (0.3, 0.32, 0.3), (0.4, 0.38, 0.4), (0, -3, 0), 4, 20, obstacles=(sheet(0.3),))
+BOTH_SIDES = joined(ABOVE, block(np.arange(20) % 4, (0.3, 0.22, 0.3), (0.4, 0.28, 0.4), (0, 3, 0), 5, 20))
+
+
 def test_teams_agree_with_the_other_launch():
     """Scenes of other sizes, densities and obstacles beside them: one frame agrees to 1e-6, ten to 1e-3 of the
     domain, in the order given; frames come one by one, and a scene that fails leaves the others as they were.
     """
-    scenes = [mixed(120, 0, (0, -3, 0)), HEAVY, mixed(1, 2, (0, 0, 0))]
+    scenes = [mixed(120, 0, (0, -3, 0)), HEAVY, mixed(1, 2, (0, 0, 0)), BOTH_SIDES]
     frames: list[int] = []
     expected = simulated(scenes, frames=11)
     found = simulate([*scenes, mixed(40, 3, (0, 1e6, 0))], CONFIG, 11, 60.0, frames.append, team=Team(1))
