@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_343,
-    "datagen": 8_958,
+    "datagen": 8_968,
     "tools": 6_302,
-    "tests": 35_510,
+    "tests": 35_514,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -330,16 +330,20 @@ class Launch(ABC):
                 f"a batch must have less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
                 "scenes_per_launch"
             )
-        places, values, end, triangle = list[np.ndarray](), list[np.ndarray](), 2 * all_nodes, 0
+        bases, triangle = sum(len(sweep.base_K3) for sweep in sweeps), 0
+        # filled in place, because memory for parts and copies takes longer than their values; bases come before lists
+        places = np.arange(2 * all_nodes - bases, end, dtype=np.int32)
+        values, filled, end = np.empty(len(places), np.int32), 0, 2 * all_nodes
         for index, (sweep, friction) in enumerate(zip(sweeps, self._frictions(), strict=True)):
             lists = triangle_lists(sweep, first_vector + TRIANGLE_VECTORS * triangle)
-            base = self._places(sweep.base_K3) + np.int32(all_nodes + index * self.scene_nodes)
-            places += [base, np.arange(end, end + len(lists), dtype=np.int32)]
-            values += [np.int32(end) + list_begins(sweep), lists]
+            own = slice(filled, filled + len(sweep.base_K3))
+            places[own] = self._places(sweep.base_K3) + np.int32(all_nodes + index * self.scene_nodes)
+            values[own] = np.int32(end) + list_begins(sweep)
+            values[bases + end - 2 * all_nodes :][: len(lists)] = lists
             vector[triangle : triangle + len(sweep.triangle_F43)] = triangle_vectors(sweep, friction)
             triangle += len(sweep.triangle_F43)
-            end += len(lists)
-        return np.concatenate(places), np.concatenate(values), end
+            filled, end = own.stop, end + len(lists)
+        return places, values, end
 
     @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -366,6 +370,8 @@ class Launch(ABC):
         for position, completed in self._advance(frames - 1):
             for rows, visible in zip(trajectory, first, strict=True):
                 rows[present : present + len(position)] = position[:, visible]
+                # first touches of memory take seconds, and a GPU would wait for them after its last frames
+                rows[present + len(position) : present + 2 * len(position)] = 0
             for frame in range(present, present + len(position)):
                 if on_frame is not None:
                     on_frame(frame)
