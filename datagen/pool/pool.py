@@ -115,7 +115,7 @@ class Pool:
             self._progress.message("other generators make the remaining episodes; waiting for them")
 
     def _publish(self) -> bool:
-        shard = self._writer.publish_next(wait=False)  # other episodes are staged while the shard is packed
+        shard = self._writer.publish_next()  # other episodes are staged while the shard is packed
         if shard is not None:
             self._progress.shard(shard.name, len(shard.episodes), self._writer.manifest.revision)
         return shard is not None

@@ -194,28 +194,25 @@ class DatasetWriter:
         """Returns whether shards are being packed."""
         return bool(self._packing)
 
-    def publish_next(self, wait: bool = True) -> ShardEntry | None:
-        """Publishes one claimed shard whose episodes are all staged, and returns its entry.
+    def publish_next(self) -> ShardEntry | None:
+        """Packs claimed shards whose episodes are all staged, and publishes one that is packed.
 
-        Returns None if no shard is complete, or with wait=False if none is packed yet. Raises: OSError (a full disk).
-        Then no partial file remains, and published shards are unchanged.
+        Returns its entry, or None if none is packed yet. Raises: OSError (a full disk). Then no partial file remains,
+        and published shards are unchanged.
         """
         ready = [
             shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
         ]
         self._sync_staged(ready, time.monotonic() - STAGED_SECONDS)
-        if not ready:
-            return None
         # two shards per packer, so that none is idle while this thread lists packed shards
-        for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 or not wait else []:
+        for shard in ready[: 2 * PACKED_AT_ONCE]:
             if shard not in self._packing:
                 self._packing[shard] = self._packers.submit(self._pack, shard)
-        if not wait:
-            ready = [shard for shard in ready if shard in self._packing and self._packing[shard].done()]
-            if not ready:
-                return None
-        entry = self._publish(ready[0])
-        self._forget(ready[0])
+        packed = next((shard for shard in ready if shard in self._packing and self._packing[shard].done()), None)
+        if packed is None:
+            return None
+        entry = self._publish(packed)
+        self._forget(packed)
         return entry
 
     def _sync_staged(self, ready: Sequence[ShardRange], before: float) -> None:
@@ -240,13 +237,13 @@ class DatasetWriter:
             return stack.pop_all(), temporary, entry
 
     def _publish(self, shard: ShardRange) -> ShardEntry:
-        packing = self._packing.pop(shard, None)
+        packing = self._packing.pop(shard)
         if winner := self._winner(shard):
-            if packing is not None:
+            if packing.exception() is None:  # it fails if the winner has deleted the staged files
                 packing.result()[0].close()
             return winner
         target = self.folder / shard.name
-        stack, temporary, entry = self._pack(shard) if packing is None else packing.result()
+        stack, temporary, entry = packing.result()
         with stack, self._locks.manifest():
             if winner := self._winner(shard):
                 return winner

@@ -171,8 +171,8 @@ class Generation:
                     entry = None
                     for split, index in writer.remaining():
                         ballistic_dataset.stage(writer, split, index)
-                        entry = writer.publish_next()
-                    entry = entry or writer.publish_next()  # of what an earlier run had staged
+                        entry = ballistic_dataset.publish(writer)
+                    entry = entry or ballistic_dataset.publish(writer)  # of what an earlier run had staged
                     promised[entry.name] = entry.sha256
 
     def check(self, folder, promised):

@@ -1,5 +1,7 @@
 """Whole data sets of the ballistic stand-in, made in this process."""
 
+from concurrent.futures import wait
+
 import ballistic_solver
 
 from datagen.pool.shard import stage_episode
@@ -20,12 +22,20 @@ def stage(writer, split, index):
     writer.add_staged(split, index)
 
 
+def publish(writer):
+    """Waits until shards are packed; publishes the first of these, and returns its entry, or None without one."""
+    if (entry := writer.publish_next()) is None:
+        wait(writer._packing.values())
+        entry = writer.publish_next()
+    return entry
+
+
 def make_dataset(config):
     """Makes a whole data set, or what is missing of it, without any worker process."""
     with DatasetWriter(config) as writer:
         while writer.claim_next():
             for split, index in writer.remaining():
                 stage(writer, split, index)
-            writer.publish_next()
+            publish(writer)
         assert writer.complete
     return writer.folder

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ballistic_dataset import publish
 from written_files import claim_all, hashes, simulated_once, snapshot
 
 import datagen.pool.shard
@@ -91,7 +92,7 @@ def test_what_is_complete(make_config, make_dataset, folder, stage, tmp_path):
     begun = {"folder": str(tmp_path / "begun")}
     with DatasetWriter(make_config(**begun)) as writer:
         stage(writer, "train", 0)
-        writer.publish_next()
+        publish(writer)
     with DatasetWriter(make_config(training_scenes=1, validation_scenes=0, test_scenes=0, **begun)) as writer:
         assert writer.complete
     assert Manifest.load(writer.folder).complete
@@ -127,14 +128,14 @@ def test_generators_share_a_folder(make_config, small_dataset, stage, control):
             stage(writer, first.split, first.first)
             partial = writer.folder / f".{second.name}.77.partial"
             partial.touch()
-            assert writer.publish_next()
+            assert publish(writer)
             assert claim_all(writer) and other.claim_next() is None and not other.complete
         assert partial.exists() and (other.folder / ".staging").exists()
         other.refresh()
         assert other.done == 1
         for split, index in claim_all(other):
             stage(other, split, index)
-        while other.publish_next():
+        while publish(other):
             pass
         assert other.complete
     assert not partial.exists() and not (other.folder / ".staging").exists()
@@ -150,9 +151,9 @@ def test_first_writer_wins(make_config, stage, monkeypatch):
         assert writer.claim_next() == other.claim_next()
         stage(writer, "train", 0)
         stage(other, "train", 0)
-        assert writer.publish_next()
+        assert publish(writer)
         before = snapshot(writer.folder)
-        assert other.publish_next() == writer.manifest.shards[0]
+        assert publish(other) == writer.manifest.shards[0]
         assert snapshot(writer.folder) == before
     assert messages == ["train-000000-000001.tar was published by another generator; this copy is dropped"]
     assert len(Manifest.load(writer.folder).shards) == 1
@@ -182,7 +183,7 @@ def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seco
                 stage(other, "train", index)
                 (writer.folder / ".staging" / f".train-00000{index}.tar.77.partial").touch()
                 turn_back(writer.folder)
-                other.publish_next()
+                publish(other)
                 turn_back(writer.folder)
             store = store or EpisodeStore(writer.folder, "train")
             store.refresh()
@@ -213,7 +214,7 @@ def test_broken_staged_file_is_made_again(make_config, make_dataset, small_datas
             staged.unlink()
             staged.symlink_to("/dev/zero") if damage == "device" else os.mkfifo(staged)
         with pytest.raises(ConfigError, match=r"train-000001\.tar must end with the sha256"):
-            while writer.publish_next():
+            while publish(writer):
                 pass
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
@@ -251,7 +252,7 @@ def test_what_is_published_is_on_the_disk(make_config, stage, monkeypatch):
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     with DatasetWriter(make_config(training_scenes=9)) as writer:
         stage(writer, "train", 0)
-        assert not on_disk(0) and writer.publish_next()
+        assert not on_disk(0) and publish(writer)
         synced.clear()  # numbers of files that are gone are given again
         stage(writer, "train", 4)  # of a shard of four
         assert writer.publish_next() is None and not on_disk(4)
@@ -277,7 +278,7 @@ def test_quarantined_seed_is_replaced(make_config, stage):
     with DatasetWriter(config) as writer:
         assert writer.task("train", 0) == replacement
         stage(writer, "train", 0)
-        writer.publish_next()
+        publish(writer)
     manifest = Manifest.load(writer.folder)
     (failure,) = manifest.quarantined
     first_seed = scene_seed(0, "train", 0, attempt=0)

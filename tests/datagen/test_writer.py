@@ -9,6 +9,7 @@ from threading import Event, Lock, current_thread
 import numpy as np
 import pytest
 import webdataset
+from ballistic_dataset import publish
 from written_files import claim_all, hashes
 
 from datagen.pool.writer import DatasetWriter
@@ -135,7 +136,7 @@ def test_full_disk_leaves_nothing_half_written(make_config, make_dataset, stage,
     no partial file; with space the run goes on."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
-        writer.publish_next()
+        publish(writer)
         before = hashes(writer.folder)
     with pytest.raises(OSError, match=r"No space left on device: .*data"), DatasetWriter(make_config()) as writer:
         if together:
@@ -145,7 +146,7 @@ def test_full_disk_leaves_nothing_half_written(make_config, make_dataset, stage,
         for index in (1, 2, 3):
             if not together:
                 stage(writer, "train", index)
-            while writer.publish_next():
+            while publish(writer):
                 pass
     assert before.items() <= hashes(writer.folder).items()
     assert not list(writer.folder.rglob("*.partial"))
@@ -169,7 +170,7 @@ def test_packing_is_not_waited_for(make_config, stage, monkeypatch):
         monkeypatch.setattr(writer, "_pack", pack)
         published: list[str] = []
         while len(published) < len(shards):
-            entry = writer.publish_next(wait=False)
+            entry = writer.publish_next()
             published += [entry.name] if entry else []
             if len(published) == len(shards) - 1:
                 assert shards[0].name not in published and writer.packing and not writer.complete
@@ -188,7 +189,7 @@ def test_shards_that_wait_are_packed_together(make_config, small_dataset, stage,
         monkeypatch.setattr(
             writer, "_pack", lambda shard, pack=writer._pack: (packed_by.append(current_thread()), pack(shard))[1]
         )
-        while writer.publish_next():
+        while publish(writer):
             pass
         assert writer.complete and len(set(packed_by)) > 1
     assert hashes(writer.folder) == hashes(small_dataset)
