@@ -35,7 +35,6 @@ class GridLaunch(Launch):
         self.spread = device_array(np.zeros(self.particles, np.int32))
         self.response = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
         self.block = device_array(np.zeros(8 * self.all_blocks + 2, np.int32))
-        self.age = device_array(np.zeros(self.rows, np.float32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter, self.law
         )

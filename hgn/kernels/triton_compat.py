@@ -102,14 +102,10 @@ def noted_launches() -> Iterator[Launches]:
             triton.knobs.runtime.jit_cache_hook = None
 
 
-def preload(function: Any, specialization: str) -> Any:
-    """Compiles a kernel for a noted specialisation, and the C code that launches it. Returns the kernel."""
-    return compile_launches([(function, specialization)])[0]
-
-
 def compile_launches(launches: Iterable[tuple[Any, str]], threads: int = 1) -> list[Any]:
-    """Compiles kernels as `preload` does, or loads them from the cache on disk. Returns the kernels.
+    """Compiles kernels for noted specialisations, and the C code that launches them. Returns the kernels.
 
+    Kernels in the cache on disk are loaded.
     Triton's compiler releases Python's lock for 85 % of its time. Triton's own function mistakes a constant for a type
     if the constant is a type's name, as the precision "fp16" is.
     """

@@ -30,13 +30,17 @@ def _copy(x, y, SIZE: tl.constexpr, PRECISION: tl.constexpr):
     tl.store(y + tl.arange(0, SIZE), tl.load(x + tl.arange(0, SIZE)))
 
 
+def compiled(function, data):
+    return triton_compat.compile_launches([(function, data)])[0]
+
+
 use_h100()
 misses = triton_compat.JitMisses()
 with triton_compat.noted_launches() as launches:
     _copy[(1,)](x=torch.zeros(16, device="meta"), y=torch.zeros(16, device="meta"), SIZE=16, PRECISION="fp16")
 ((function, data),) = launches.values()
 assert misses.count == 0 and triton_compat.capability() == 90 and not triton_compat.interpreting()
-kernel = triton_compat.preload(function, data)
+kernel = compiled(function, data)
 assert misses.count == 1 and misses.seconds > 0, "Triton tells of no compilation"
 assert "st.global" in kernel.asm["ptx"] and kernel.metadata.target.arch == 90
 print("CANARY", function.__name__, flush=True)
@@ -70,7 +74,7 @@ for precision in ("fp16", "tf32"):
         many_warps = json.loads(data)["options"]["num_warps"] > 4
         if name.endswith("weight_gradient") if precision == "fp16" else many_warps and name not in seen:
             seen.add(name)
-            asm = triton_compat.preload(function, data).asm
+            asm = compiled(function, data).asm
             if "wgmma" not in asm["ptx"]:
                 continue
             if name.endswith("weight_gradient") and precision == "fp16":
@@ -84,7 +88,7 @@ narrow = NetworkConfig(width=64, levels=1, message_passing_steps=1)
 for function, data in frame_of(narrow, StepConfig(), "fp16", (10_000,), particles=40_000)[0].values():
     if function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.features.kernel"):
         continue  # knows no width
-    print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)
+    print("SHARED", function.__name__, compiled(function, data).metadata.shared, flush=True)
 
 triton_compat.use_target(90)
 seen = set()
@@ -96,7 +100,7 @@ for function, data in of_relative.values():
         continue
     seen.add(name)
     CUDABackend.make_ptx = make_ptx if early else no_ptx
-    before, *after = triton_compat.preload(function, data).asm["ptx"].split("griddepcontrol.wait")
+    before, *after = compiled(function, data).asm["ptx"].split("griddepcontrol.wait")
     print("COMPILED", name, flush=True)
     if early:
         print("EARLY", name, len(after), before.count("st.global") + before.count("atom.global"), flush=True)

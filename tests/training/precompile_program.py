@@ -20,7 +20,7 @@ from triton.runtime.jit import JITFunction
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.kernels import triton_compat
-from hgn.kernels.triton_compat import noted_launches, preload
+from hgn.kernels.triton_compat import compile_launches, noted_launches
 from hgn.runtime import triton_stepper
 from hgn.schema import to_mapping
 from hgn.step_config import StepConfig
@@ -46,7 +46,7 @@ for order in (list(found.values()), list(found.values())[::-1]):
     if child == 0:
         JITFunction._do_compile = tell
         for function, data in order:
-            preload(function, data)
+            compile_launches([(function, data)])
         print(flush=True)
         os._exit(0)
     if os.waitpid(child, 0)[1]:

@@ -62,10 +62,6 @@ class Window:
             cells.append(math.ceil((last - first + 1) / unit) * unit)
         return Window((low[0], low[1], low[2]), (cells[0], cells[1], cells[2]))
 
-    @property
-    def slots(self) -> int:
-        return math.prod(n + 2 for n in self.cells)
-
 
 def own_physics_column(config: NetworkConfig) -> int:
     """Returns the first column of own physics in the encoder's input."""
