@@ -48,9 +48,9 @@ def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.templa
             line = ti.Vector([0.0, 0.0, 0.0, 0.0])
             line_z = ti.Vector([0.0, 0.0, 0.0])
             for k in ti.static(range(3)):
-                share = w[k][2] * load4(arrays.node, index_x[i] + index_y[j] + index_z[k])
-                line += share
-                line_z += (k - fx[2]) * _vector(share)
+                node = load4(arrays.node, index_x[i] + index_y[j] + index_z[k])
+                line += w[k][2] * node
+                line_z += w[k][2] * (k - fx[2]) * _vector(node)
             plane += w[j][1] * line
             plane_y += w[j][1] * (j - fx[1]) * _vector(line)
             plane_z += w[j][1] * line_z
