@@ -249,6 +249,15 @@ def test_types_without_a_name_in_own_materials_are_refused(types, tmp_path):
     import_trajectories.main(options(tmp_path / "mine", source, materials={str(number): "clay"}))
 
 
+@pytest.mark.parametrize("gravity", [None, [0.0, -9.8, 0.0]])
+def test_sets_without_moving_particles_are_refused(gravity, tmp_path):
+    """Also where gravity is estimated from their flight, or compared with it."""
+    source = write(tmp_path / "foreign", "plain", {}, metadata(gravity=gravity))
+    np.savez(source / "train.npz", **{"a/position": np.full((20, 9, 3), 0.5, np.float32), "a/particle_type": 3})
+    with pytest.raises(ConfigError, match="position must be of particles that are not obstacles, got"):
+        import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
+
+
 def test_a_record_without_a_feature_is_refused(tmp_path):
     """A SequenceExample lacks particle_type; and bytes that are none are no message."""
     from hgn.data.foreign.tfrecord import parse_sequence_example

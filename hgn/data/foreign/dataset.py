@@ -139,7 +139,7 @@ def _neighbour_count(first: list[Trajectory], info: SetInfo) -> float:
             counts.append(tree.query_ball_point(some_nD, info.radius, return_length=True) - 1)
             if len(position_ND) > USUAL_NEIGHBOURS:
                 usual.append(tree.query(some_nD, k=[USUAL_NEIGHBOURS + 1])[0])
-    mean = sum(int(count_n.sum()) for count_n in counts) / max(1, sum(map(len, counts)))
+    mean = float(np.concatenate(counts).mean())
     if usual and mean < 1:
         raise ConfigError(
             f"radius must contain at least 1 neighbour on average, got {mean:.2g} within {info.radius:g}; "

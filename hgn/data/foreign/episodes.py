@@ -60,7 +60,6 @@ class Converter:
         frames, first = len(trajectory.position_TND), self.history
         require(frames >= first + 2, f"{name}: position", f"of at least {first} + 2 frames for history={first}", frames)
         fixed_N = np.isin(trajectory.type_N, list(info.boundary_types))
-        require(not fixed_N.all(), f"{name}: position", "of particles that are not obstacles", "none", "leave it out")
         require_inside(trajectory, info)
         require_fine(name, trajectory.position_TND, info.radius)
         position_TN3 = self._placed(trajectory.position_TND)

@@ -151,8 +151,11 @@ def _step(position_TND: np.ndarray, radius: float) -> float:
 
 
 def require_inside(trajectory: Trajectory, info: SetInfo) -> None:
-    """Refuses bounds that do not contain the moving particles of the first frame."""
-    place_ND = trajectory.position_TND[0, ~np.isin(trajectory.type_N, list(info.boundary_types))].astype(np.float64)
+    """Refuses trajectories without moving particles, and bounds that do not contain those of the first frame."""
+    free_N = ~np.isin(trajectory.type_N, list(info.boundary_types))
+    rule = "of particles that are not obstacles"
+    require(bool(free_N.any()), f"{trajectory.name}: position", rule, "none", "leave it out")
+    place_ND = trajectory.position_TND[0, free_N].astype(np.float64)
     low_D, high_D = np.array(info.bounds).T
     outside_N = ((place_ND < low_D - info.radius) | (place_ND > high_D + info.radius)).any(-1)
     if outside_N.sum() > OUTSIDE * len(place_ND):
