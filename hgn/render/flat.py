@@ -16,6 +16,7 @@ from hgn.render.renderer import (
     LINE_COLOR,
     OBSTACLE_COLOR,
     SUPERSAMPLING,
+    TALLEST,
     WALL_COLOR,
     Camera,
     Stage,
@@ -32,7 +33,8 @@ class FlatCamera(Camera):
         margin = 0.02 * size
         self.axes = np.eye(3)
         self.nearest = 0.0
-        self.scale = SUPERSAMPLING * (size - 2 * margin) / domain_size[0]
+        most_2 = np.array((size, TALLEST * size)) - 2 * margin
+        self.scale = SUPERSAMPLING * float(np.min(most_2 / np.array(domain_size[:2])))
         self.width = SUPERSAMPLING * size
         self.height = SUPERSAMPLING * math.ceil(domain_size[1] * self.scale / SUPERSAMPLING + 2 * margin)
         size_2 = np.array(domain_size[:2]) * self.scale

@@ -34,6 +34,7 @@ LINE_COLOR = np.array((0.80, 0.82, 0.85), np.float32)
 BOX_COLOR = (150, 156, 166)
 
 SUPERSAMPLING = 2
+TALLEST = 4  # largest height of a picture in its widths
 LAYERS = 4
 OBSTACLE_OPACITY = 0.34
 MOST_SHARED = 64  # corners at a place that a smoothed normal averages; all pairs could take minutes
@@ -45,7 +46,7 @@ SHADOW_CELLS = 160  # number of cells of the floor's shadow map along the longer
 
 
 class Camera:
-    """Looks in perspective at the box [0, domain_size], y up, and fits the box into a width of `size` pixels.
+    """Looks in perspective at the box [0, domain_size], y up, and fits it into `size` pixels by TALLEST times as many.
 
     `width` and `height` are the sizes of the supersampled picture.
     """
@@ -65,7 +66,7 @@ class Camera:
         xy, _ = self.project(corner_83)
         low, high = xy.min(axis=0), xy.max(axis=0)
         margin = 0.02 * size
-        self.scale = SUPERSAMPLING * (size - 2 * margin) / (high[0] - low[0])
+        self.scale = SUPERSAMPLING * float(np.min((np.array((size, TALLEST * size)) - 2 * margin) / (high - low)))
         self.width = SUPERSAMPLING * size
         self.height = SUPERSAMPLING * math.ceil((high[1] - low[1]) * self.scale / SUPERSAMPLING + 2 * margin)
         self.offset = np.array((self.width, self.height)) / 2 - (low + high) / 2 * self.scale

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from hgn.render import fragments as fragments_module
+from hgn.render.flat import FlatStage
 from hgn.render.fragments import fragments
 from hgn.render.renderer import LIGHT, MATERIAL_COLORS, Camera, Stage, smooth_normals
 from hgn.scene.scene import Obstacle
@@ -77,6 +78,16 @@ def test_camera_fits_the_domain(domain_size):
     assert (xy >= 0).all() and (xy <= (camera.width, camera.height)).all()
     assert np.ptp(xy[:, 0]) > 0.95 * camera.width
     assert (xy[2::4, 1] < xy[0::4, 1]).all()
+
+
+@pytest.mark.parametrize("stage_type", [Stage, FlatStage])
+def test_tall_domains(stage_type):
+    """A picture is at most four times as high as wide; a taller domain lies in its middle."""
+    stage = stage_type((1.0, 1e9, 1.0), (), 1e6, 64)
+    assert stage.size[0] == 64 and stage.size[1] <= 4 * 64
+    xy, _ = stage.camera.project(np.array([[0, 0, 0], [1, 1e9, 0], [0.0, 1e9, 1.0]]))
+    np.testing.assert_allclose(xy[:, 0], 64, atol=1)
+    assert np.ptp(xy[:, 1]) > 0.95 * stage.camera.height and (xy[:, 1] <= stage.camera.height).all()
 
 
 def test_nearer_particles_cover_farther_ones():
