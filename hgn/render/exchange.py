@@ -124,12 +124,14 @@ def fluid_surface(position_N3: np.ndarray, spacing: float) -> tuple[np.ndarray, 
 
 
 def _surfaces(rollout: Rollout) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields the surface of each frame."""
+    """Yields the surface of each frame. Omits particles that are not finite or farther than ten domains away."""
+    largest = max(rollout.domain_size)
     fluid_N = np.isin(rollout.material_N, FLUIDS)
-    spacing = rollout_spacing(rollout, fluid_N)
+    spacing = max(rollout_spacing(rollout, fluid_N), 1e-4 * largest)  # splashsurf refuses more than 2^63 cells
     for frame, position_N3 in enumerate(rollout.position_TN3):
         present = rollout.present(frame)
-        yield fluid_surface(position_N3[:present][fluid_N[:present]], spacing)
+        water_N3 = position_N3[:present][fluid_N[:present]]
+        yield fluid_surface(water_N3[(np.abs(water_N3) < 10 * largest).all(axis=1)], spacing)
 
 
 def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:

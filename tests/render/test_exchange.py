@@ -150,6 +150,20 @@ def test_the_surface_encloses_the_water(random):
     assert [array.shape for array in fluid_surface(np.zeros((0, 3)), SPACING)] == [(0, 3), (0, 3)]
 
 
+@pytest.mark.parametrize("ending", ["usdc", "ply"])
+def test_surfaces_of_diverged_rollouts(tmp_path, rollout, ending):
+    """Water that is not finite or far away, as all of it in the last frame, has no surface; water at one place has."""
+    position_TN3 = rollout.position_TN3.copy()
+    position_TN3[0, 0], position_TN3[1, 0], position_TN3[2] = np.nan, 500.0, np.nan
+    position_TN3[:2, 2:] = 0.5
+    save_rollout(tmp_path / f"a.{ending}", replace(rollout, position_TN3=position_TN3), surface=True)
+    if ending == "usdc":
+        stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+        surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/surface"))
+        sizes = [np.abs(surface.GetPointsAttr().Get(frame)).max(initial=0) for frame in range(3)]
+        assert 0.4 < sizes[0] < 0.6 and 0.4 < sizes[1] < 0.6 and sizes[2] == 0
+
+
 def test_what_cannot_be_written_is_said_before_the_simulation(monkeypatch):
     """A surface in VTKHDF; USD without its library."""
     with pytest.raises(ConfigError, match="surface must be false unless out ends in"):
