@@ -200,9 +200,7 @@ class LiveSimulation:
         """Changes a scene, but not its particles."""
         self._require_scene(index)
         scene = replace(self.scenes[index], **changes)
-        arrays = ("position_N3", "velocity_N3", "material_N")
-        empty: dict[str, Any] = {name: getattr(scene, name)[:0] for name in arrays}
-        self._put(index, scene, self.state, self._started([replace(scene, **empty, past_HN3=None, body_N=None)]))
+        self._put(index, scene, self.state, self._started([scene.selected(slice(0))]))
 
     def _put(
         self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState, restart: bool = False

@@ -77,6 +77,17 @@ class InitialState:
             value = getattr(self, name)
             fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)  # type: ignore[operator]
             require(fits, name, "three numbers of at most 1e9", value)
+        count = len(self.position_N3)
+        for name, axis in (("parameters", 0), ("body_N", 0), ("past_HN3", 1)):
+            shape = np.shape(getattr(self, name))
+            fits = getattr(self, name) is None or shape[axis : axis + 1] == (count,)
+            require(fits, name, f"of {count} particles", shape, remedy="select some of the particles with `selected`")
+
+    def selected(self, chosen_N: np.ndarray | slice) -> InitialState:
+        """Returns the start of some of the particles."""
+        names = ("position_N3", "velocity_N3", "material_N", "parameters", "body_N")
+        some: dict[str, Any] = {name: value[chosen_N] for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **some, past_HN3=None if self.past_HN3 is None else self.past_HN3[:, chosen_N])
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:

@@ -67,7 +67,8 @@ def test_a_scene_that_changes_is_one_that_began_so(backend):
 
 def test_friction_and_parameters_belong_to_scenes_and_particles():
     """A scene with its own physics that replaces a plain one moves as if it had begun so, and a plain one after it as
-    without friction; particles that are added have the solver's parameters."""
+    without friction; particles that are added have the solver's parameters. A start with some of its particles has
+    their parameters, and arrays of other lengths are refused."""
     own = small(inputs="local", own_physics=("friction", "parameters"))
     torch.nn.init.normal_(own.encode.first.weight)
     simulator, plain, other = Simulator(own, 60.0), scene(30), rough(scene(20, 1))
@@ -80,9 +81,17 @@ def test_friction_and_parameters_belong_to_scenes_and_particles():
     live.reset(0, plain)
     np.testing.assert_array_equal(frames(live, 4), np.concatenate([expected[0]] * 2, 1))
     added = LiveSimulation(simulator, other)
+    added.set_gravity(other.gravity)
+    added.replace_obstacles(other)
     entering(added, scene(10, 2))
     whole = joined(other, scene(10, 2)) | {"parameters": np.concatenate([other.parameters, nominal(10)])}
-    np.testing.assert_array_equal(frames(added, 4), simulator.rollout([replace(other, **whole)], 5)[0][1:])
+    whole = replace(other, **whole)
+    np.testing.assert_array_equal(frames(added, 4), simulator.rollout([whole], 5)[0][1:])
+    one = replace(whole, body_N=np.arange(30), past_HN3=np.tile(whole.position_N3, (5, 1, 1))).selected(slice(20, 21))
+    assert (one.body_N.tolist(), one.past_HN3.shape, one.parameters.tolist()) == ([20], (5, 1, 3), nominal(1).tolist())
+    for name, value in (("parameters", nominal(29)), ("body_N", np.arange(29)), ("past_HN3", np.zeros((5, 29, 3)))):
+        with pytest.raises(ConfigError, match=rf"{name} must be of 30 particles, got \(.*29.*\)"):
+            replace(whole, **{name: value})
 
 
 def nominal(count):
