@@ -19,8 +19,10 @@ from hgn.runtime.divergence import DivergedError, diverged
 from hgn.runtime.simulation import joined
 from hgn.runtime.simulator import InitialState, Simulator, initial_states
 from hgn.scene.barrier import Barrier
+from hgn.scene.motion import Motion
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
-from hgn.schema import require, require_count
+from hgn.schema import Vector, require, require_count, triple
 
 
 class LiveSimulation:
@@ -139,6 +141,31 @@ class LiveSimulation:
         other = InitialState.of(scene)
         own = {"obstacle_grid": other.obstacle_grid, "corners": other.corners, "moving": other.moving}
         self._change_scene(index, **own)
+
+    def move_obstacle(
+        self, number: int, translation: Vector, rotation: Vector = (0.0, 0.0, 0.0), index: int = 0
+    ) -> None:
+        """Moves an obstacle evenly during the next frame, and ends its keyframes. It then rests until moved again.
+
+        `number` counts the scene's obstacles with keyframes. Translation (domain units) and rotation (degrees) are
+        relative to its entry, as in a keyframe. `restore` does not move it back.
+        Raises: ConfigError if there is no such obstacle, and as keyframes do.
+        """
+        self._require_scene(index)
+        moving, own = self.state.moving, [*self.scenes[index].moving]
+        rule = f"0 to {len(own) - 1}, an obstacle" if own else "left out: the scene has no obstacles"
+        valid = isinstance(number, Integral) and 0 <= number < len(own)
+        require(valid, "number", f"{rule} with keyframes", number)
+        assert moving is not None
+        before, time_T = own[number].motion, (moving.frames[index] + np.arange(2)) * moving.frame_s
+        turn_33, shift_3 = before.pose(time_T[0])
+        later_33 = euler_rotation(triple(_array("rotation", np.array(rotation), (3,))))
+        shift_T3 = np.stack([shift_3, _array("translation", np.array(translation), (3,))])
+        own[number] = replace(own[number], motion=Motion(time_T, shift_T3, np.stack([turn_33, later_33]), before.pivot))
+        scenes = [*self.scenes]
+        scenes[index] = replace(scenes[index], moving=tuple(own))
+        moved = replace(moving, scenes=tuple(scene.moving for scene in scenes)).at(moving.frames)
+        self._changed, self.scenes = replace(self.state, moving=moved), scenes
 
     def set_gravity(self, gravity: tuple[float, float, float], index: int = 0) -> None:
         """Replaces gravity, in domain units per second squared.

@@ -94,8 +94,10 @@ def test_scene(here):
 
 
 def test_live(here):
-    """Many live scenes: each ends after two frames and begins anew, with its own number of particles."""
-    runner = Runner(SETTINGS, {"range(300)": "range(3)", "episode_frames=120": "episode_frames=2"})
+    """Many live scenes: each ends after two frames and begins anew, with its own number of particles. A plate that is
+    moved pushes sand."""
+    fewer = {"range(300)": "range(3)", "episode_frames=120": "episode_frames=2", "range(1, 21)": "range(1, 4)"}
+    runner = Runner(SETTINGS, fewer)
     runner.run(ROOT / "docs/how_to/live.md")
     names = runner.names
     assert np.shares_memory(names["shared_N3"], names["position_N3"].numpy())

@@ -27,6 +27,7 @@ from hgn.scene.random_scene import generate_scene
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene_file import scene_of
 from hgn.scene.shapes import shape_obstacle
+from hgn.schema import ConfigError
 from hgn.step.reference import accelerations, advanced
 from hgn.training.symmetry import _points, _vectors, moving_under
 
@@ -231,3 +232,39 @@ def test_simulations_move_obstacles():
         ends = [[x + s * step * way_3 if i == number else x for i, x in enumerate(inputs)] for s in (1, -1)]
         slope = float((total(*ends[0]) - total(*ends[1])).detach()) / (2 * step)
         assert slope == pytest.approx(float(gradient @ way_3), rel=1e-4) and slope != 0
+
+
+def test_a_program_moves_obstacles():
+    """Moved before each frame, the second obstacle of a scene acts bitwise as with keyframes at all frames, also after
+    a reset and if it is placed twice. The first one and the other scene go on as before."""
+    drawn, frames = yaml.safe_load(SCENE), 12
+    drawn["obstacles"].append(drawn["obstacles"][0] | {"position": [0.5, 0.6, 0.5], "keyframes": [{"time": 0}]})
+    begin = scene_of(drawn, "a.yaml")
+    places = [((0.002 * t, -0.004 * t, 0.001 * t * t), (0.0, 3.0 * t, 1.0 * t)) for t in range(frames)]
+    own = [{"time": t * FRAME_S, "translation": [*p], "rotation": [*r]} for t, (p, r) in enumerate(places)]
+    drawn["obstacles"][1]["keyframes"] = own
+    simulator = Simulator(network_for(dtype=torch.float32), 60.0, "torch")
+    still_TN3, moved_TN3 = simulator.rollout([begin, scene_of(drawn, "a.yaml")], frames)
+    assert np.abs(moved_TN3 - still_TN3).max() > 1e-3
+    with LiveSimulation(simulator, [begin, begin]) as live:
+        for place in places[1:5]:
+            live.move_obstacle(1, *place, index=1)
+            live.step()
+        live.reset(0, begin)
+        live.reset(1, begin)
+        for frame, place in enumerate(places[1:], 1):
+            live.move_obstacle(1, (0.1, 0.1, 0.1), index=1)
+            live.move_obstacle(1, *place, index=1)
+            np.testing.assert_array_equal(live.step(), np.concatenate([still_TN3[frame], moved_TN3[frame]]))
+        for number, place, message in (
+            (2, places[1], "number must be 0 to 1, an obstacle with keyframes, got 2"),
+            (1, ((0.1, 0.1),), r"translation must be of shape \(3,\), got \(2,\)"),
+            (1, (places[1][0], (np.inf, 0, 0)), "rotation must be finite, got inf"),
+        ):
+            with pytest.raises(ConfigError, match=message):
+                live.move_obstacle(number, *place)
+    with (
+        LiveSimulation(simulator, replace(InitialState.of(begin), moving=())) as live,
+        pytest.raises(ConfigError, match="number must be left out: the scene has no obstacles with keyframes, got 0"),
+    ):
+        live.move_obstacle(0, (0.1, 0.1, 0.1))
