@@ -369,6 +369,7 @@ class Simulator:
         Raises: ConfigError and DivergedError as `rollout`.
         """
         require(isinstance(scene, Scene), "scene", "a Scene", type(scene).__name__)
+        require(not scene.emits, "emitters", "left out here", "some", remedy="use rollout")
         posed = isinstance(poses, Mapping | None) and all(isinstance(pose, Pose) for pose in (poses or {}).values())
         require(posed, "poses", "a Pose by the number of its obstacle", poses)
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)

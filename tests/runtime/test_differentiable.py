@@ -228,6 +228,13 @@ def test_what_is_refused(options, message):
         Simulator(network("absolute"), 60.0, "torch").differentiable(scene(), **({"frames": 2} | options))
 
 
+def test_emitters_are_refused():
+    """By name: the result has the same particles in all frames."""
+    emitting = replace(scene(), entry_s_N=np.linspace(0, 1, PARTICLES))
+    with pytest.raises(ConfigError, match="emitters must be left out here, got 'some'; use rollout"):
+        Simulator(network("absolute"), 60.0, "torch").differentiable(emitting, 2)
+
+
 def test_friction_between_posed_obstacles_is_their_mean():
     """With distances a particle is within reach of two plates whose normals are short: friction is no sum."""
     plates = tuple(
