@@ -80,7 +80,7 @@ class PlaySession:
         self._owed = 0.0  # fraction of a particle that the spout has yet to release
         self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
-        require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
+        require(not scene.moves, "obstacles", "at rest in hgn.play", "keyframes", "leave them out")
         self.obstacles: tuple[PlacedObstacle, ...] = tuple(
             placed_by(from_mapping(ObstacleEntry, entry), folder, scene.cell_size)
             for entry in scene.specification.get("obstacles", ())

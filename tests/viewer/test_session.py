@@ -107,6 +107,13 @@ def test_obstacles_that_are_moved_hold(session):
     assert (steps(session, 2)[:, 1] < 0.3).all()
 
 
+def test_keyframes_are_refused(folder):
+    """Also with weights that see motion, because viewers move the obstacles."""
+    (folder / "moving.yaml").write_text(SCENE.replace("[0, 30, 0]}", "[0, 30, 0], keyframes: [{time: 0}]}"))
+    with pytest.raises(ConfigError, match=r"obstacles must be at rest in hgn\.play, got 'keyframes'; leave them out"):
+        PlaySession(free_flight(own_physics=("moving",)), load_scene(folder / "moving.yaml"), folder)
+
+
 def test_a_dragged_obstacle_carries_particles_along(session):
     """With weights that see motion a plate that is dragged up lifts particles by its displacement in a frame, and rests
     afterwards; a jump has no velocity."""
