@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_342,
+    "hgn": 34_379,
     "datagen": 8_964,
     "tools": 6_302,
-    "tests": 35_565,
+    "tests": 35_628,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 
