@@ -17,7 +17,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_379,
-    "datagen": 8_964,
+    "datagen": 8_919,
     "tools": 6_302,
     "tests": 35_628,
 }

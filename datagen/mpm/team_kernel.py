@@ -71,7 +71,7 @@ TeamArrays = namedtuple(
     "TeamArrays",
     [
         "state", "node", "tag", "rank", "strained", "covered", "spread", "response", "hidden", "cell_count",
-        "column_count", "column_list", "occupied", "block", "live", "columns", "meeting", "turn", "scene_value",
+        "column_count", "column_list", "block", "live", "columns", "meeting", "turn", "scene_value",
         "counter", "setting", "law", "shape", "contact", "contact_normal", "pose", "output", "variant",
         "threads", "several", "run", "giving",
     ],
@@ -197,11 +197,11 @@ def advance(
     frames: ti.i32, stretch: ti.i32, teams: ti.i32, blocks: ti.i32, patience: ti.i32, frame_s: ti.f32,
     state_address: ti.u64, node_address: ti.u64, node_entries: ti.i32, tag: Integers, rank: Integers,
     strained: Scalars, covered: Scalars, spread: Integers, response: Scalars, hidden: Integers,
-    cell_count: Integers, column_count: Integers, column_list: Integers, occupied: Integers, block: Integers,
-    live: Integers, columns: Integers, meeting: Integers, turn: Integers,
-    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2), counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    setting: Scalars, law: Scalars, shape: Integers, contact: Integers, contact_normal: Vectors, pose: Scalars,
-    output: Scalars, variant: ti.template(), threads: ti.template(), several: ti.template(), run: ti.template(),
+    cell_count: Integers, column_count: Integers, column_list: Integers, block: Integers, live: Integers,
+    columns: Integers, meeting: Integers, turn: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), setting: Scalars, law: Scalars, shape: Integers,
+    contact: Integers, contact_normal: Vectors, pose: Scalars, output: Scalars, variant: ti.template(),
+    threads: ti.template(), several: ti.template(), run: ti.template(),
 ):  # fmt: skip
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
@@ -212,7 +212,7 @@ def advance(
     At addresses (see device_memory): state [2 * fields * P]; node [2, G, 4]. node[0] has changes of momentum in a step
     and of mass in an interval (zero between them); node[1] has velocities, and at an interval's end the mass.
     Arrays: tag [2 * 3 * P]; work space rank, spread, response [6 * P], hidden (see grid_kernel.substep) and column_list
-    [P], occupied [G]; zero at first are cell_count [G], column_count [G / 4], the flags in block [8 * G / 64], columns
+    [P]; zero at first are cell_count [G], column_count [G / 4], the flags in block [8 * G / 64], columns
     [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes]; turn [scenes] is the order of the scenes, long
     ones first. Scenes that failed do not change.
     """
@@ -232,12 +232,11 @@ def advance(
         node = node_address
         arrays = ti.static(TeamArrays(
             state, node, tag, rank, strained, covered, spread, response, hidden, cell_count, column_count,
-            column_list, occupied, block, live, columns, meeting, turn, scene_value, counter, setting, law, shape,
-            contact, contact_normal, pose, output, variant, threads, several, run, rank,
+            column_list, block, live, columns, meeting, turn, scene_value, counter, setting, law, shape, contact,
+            contact_normal, pose, output, variant, threads, several, run, rank,
         ))  # fmt: skip
         meetings = 0
         choices = 0
-        kept = 0
         at = (team + 1) * MEETING
         segment = SEGMENT * (team * blocks + part)
         thread = ti.static(Thread(lane, part, blocks, member, members, stride, velocities, at, segment, patience))
@@ -316,9 +315,8 @@ def advance(
                         if not ends and member == members - 1:
                             choose(scene, arrays)
                         update_nodes(
-                            thread, scene, begins, ends, some_wait, now, whole, left, gravity_time, fallen, kept,
-                            arrays,
-                        )  # fmt: skip
+                            thread, scene, begins, ends, some_wait, now, whole, left, gravity_time, fallen, arrays
+                        )
                         meet_team(thread, meetings, arrays)
                         if ends:
                             _move(share, thread, particles, tags, arrays)

@@ -80,7 +80,7 @@ class TeamLaunch(Launch):
         tag[0, TAG.origin] = order - np.repeat(self.particle_begin[:-1], np.diff(self.particle_begin))
         self.tag = device_array(tag.ravel())
         self.rank, self.column_list = (ti.ndarray(ti.i32, self.particles) for _ in range(2))
-        self.cell_count, self.occupied = (ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES) for _ in range(2))
+        self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.column_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES // BLOCK)
         self.strained = device_array(np.full(self.particles, -1, np.float32))
         self.covered = ti.ndarray(ti.f32, self.particles)
@@ -176,8 +176,8 @@ class TeamLaunch(Launch):
             frames, stretch, teams, blocks, PATIENCE[self.team.threads > 1], self.frame_s,
             address(self.state), address(self.node), self.node.shape[0], self.tag, self.rank, self.strained,
             self.covered, self.spread, self.response, self.hidden, self.cell_count, self.column_count,
-            self.column_list, self.occupied, self.block, self.live, self.columns, self.meeting, self.turn,
-            self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal,
-            self.pose, output, self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
+            self.column_list, self.block, self.live, self.columns, self.meeting, self.turn, self.scene_value,
+            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, self.pose, output,
+            self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip
         return output

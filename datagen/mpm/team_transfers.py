@@ -12,7 +12,7 @@ from datagen.mpm.mls_mpm import node_velocity
 from datagen.mpm.multiple_time_stepping import change_of
 from datagen.mpm.nodes import base_node, ghost_place, node_place, node_places, second_field, spline, weights
 from datagen.mpm.team_lists import IDLE
-from datagen.mpm.team_meeting import GIVING, WARP
+from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
 
@@ -235,54 +235,19 @@ def _update(
 
 
 @ti.func
-def _keep(chosen: ti.i32, kept: ti.template(), lane: ti.i32, threads: ti.template()) -> ti.i32:
-    """Returns the place of this thread's entry in its warp's list of `kept` entries, and counts the warp's new entries.
-
-    A thread has an entry if `chosen` is 1. All threads of a warp call the function together.
-    """
-    place = kept
-    if ti.static(threads > 1):
-        votes = ti.simt.warp.ballot(chosen)
-        place += ti.math.popcnt(votes & ((1 << lane) - 1))
-        kept += ti.math.popcnt(votes)
-    else:
-        kept += chosen
-    return place
-
-
-@ti.func
 def update_nodes(
     thread: ti.template(), scene: ti.i32, begins: ti.f32, ends: ti.i32, some_wait: ti.i32, now: ti.i32,
-    whole_step: ti.f32, left: ti.f32, gravity_time: ti.f32, fallen: ti.f32, kept: ti.template(),
-    arrays: ti.template(),
+    whole_step: ti.f32, left: ti.f32, gravity_time: ti.f32, fallen: ti.f32, arrays: ti.template(),
 ):  # fmt: skip
-    """Computes the new velocities of nodes with mass, with `some_wait` only in blocks that change now.
-
-    Two thirds of the nodes in touched blocks have no mass, and masses stay the same within an interval. So the first
-    substep visits all nodes of touched blocks, and lists those with mass. The other substeps visit only these. Each
-    warp has its own list of `kept` nodes, in `occupied` at the places of the first nodes that it visits.
-    """
-    lists = ti.static(not arrays.variant & VARIANT.each_step)
-    warp = ti.static(WARP if arrays.threads > 1 else 1)
+    """Computes the nodes' new velocities in all touched blocks, with `some_wait` only in those that change now."""
     block_list = arrays.shape[SHAPE.all_blocks] + scene * arrays.shape[SHAPE.scene_blocks]
-    first_node = scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES
-    lane = thread.lane % warp
-    first = thread.member - lane
-    at = lane
-    end = kept
-    if begins == 1.0:
-        nodes = arrays.live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
-        end = (ti.max(nodes - first, 0) + thread.members - 1) // thread.members * warp
-        kept = 0
-    while at < end:
-        n = first + at // warp * thread.members + lane
-        at += warp
-        if ti.static(lists):  # noqa: SIM102 (this one is the compiler's)
-            if begins == 0.0:
-                n = arrays.occupied[first_node + n]
+    count = arrays.live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
+    n = thread.member
+    while n < count:
         touched = arrays.block[block_list + n // BLOCK_NODES]
         corner = arrays.block[block_list + arrays.shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
+        n += thread.members
         many = 1.0
         if some_wait:
             many = change_of(arrays.block[3 * arrays.shape[SHAPE.all_blocks] + touched], now)
@@ -295,8 +260,9 @@ def update_nodes(
         if ti.static(bool(arrays.variant & VARIANT.contact)):
             entry = arrays.contact[touched * BLOCK_NODES + local]
         gain, mass, before = _read_node(place, thread.velocities, begins, arrays.node)
-        has_mass = ti.cast(mass > 0.0, ti.i32)
-        if has_mass:  # other nodes keep an earlier velocity, which has weight 0 for every particle
+        if local == 0:
+            arrays.block[touched] = 0
+        if mass > 0.0:  # other nodes keep an earlier velocity, which has weight 0 for every particle
             _update(
                 place, 2 * entry, gain, mass, before, thread.velocities, local, corner, scene, begins, ends,
                 gravity_time, lead, fallen, arrays,
@@ -306,16 +272,7 @@ def update_nodes(
             if second >= 0:
                 ghost = LANES * (arrays.shape[SHAPE.ghost_begin] + second)
                 gain_there, mass_there, before_there = _read_node(ghost, thread.velocities, begins, arrays.node)
-                has_mass |= ti.cast(mass_there > 0.0, ti.i32)
                 _update(
                     ghost, 2 * entry + 1, gain_there, mass_there, before_there, thread.velocities, local, corner, scene,
                     begins, ends, gravity_time, lead, fallen, arrays,
                 )  # fmt: skip
-        if begins == 1.0:
-            if local == 0:
-                arrays.block[touched] = 0
-            if ti.static(lists):
-                place_kept = _keep(has_mass, kept, lane, arrays.threads)
-                if has_mass:
-                    entries = first_node + first + place_kept % warp
-                    arrays.occupied[entries + place_kept // warp * thread.members] = n
