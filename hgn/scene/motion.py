@@ -37,7 +37,7 @@ class Motion:
     def __post_init__(self) -> None:
         times = np.asarray(self.time_T, np.float64)
         ordered = len(times) > 0 and bool(np.isfinite(times).all() and (np.diff(times) >= LEAST_S).all())
-        require(ordered, "keyframes", f"in order of time, {LEAST_S:g} s apart, and at least one", times.tolist())
+        require(ordered, "keyframes", f"in order of time and {LEAST_S:g} s apart", times.tolist())
         require(times[0] >= 0, "keyframes", "at times >= 0", times.tolist())
         farthest = float(np.abs(self.translation_T3).max())
         require(farthest <= FARTHEST, "keyframes", f"translations of at most {FARTHEST:g} units", farthest)

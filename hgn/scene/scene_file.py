@@ -40,6 +40,7 @@ from hgn.schema import (
     require,
     require_bounds,
     to_mapping,
+    triple,
 )
 from hgn.system.yaml_files import read_yaml
 
@@ -50,6 +51,7 @@ MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 10_000_000, 256  # entries are obstacles, o
 FILES_BYTES, REPEATS = 12 << 20, 8
 MEASURE = "measure"  # section of files in conf/gallery that tools.stability reads
 MILLIMETRES = "a file in millimetres needs scale: 0.001"
+MOST_TURNS = 1000  # of an obstacle between keyframes that are 180 degrees or more apart
 EMITTER_STREAM = 2**31  # key of the emitters' random streams, which are separate from those of groups
 
 
@@ -94,12 +96,25 @@ class ObstacleEntry:
         """Returns the motion of the obstacle, or None."""
         if not self.keyframes:
             return None
-        return Motion(
-            np.array([keyframe.time for keyframe in self.keyframes], np.float64),
-            np.array([keyframe.translation for keyframe in self.keyframes], np.float64),
-            np.stack([euler_rotation(keyframe.rotation) for keyframe in self.keyframes]),
-            self.position or (0.0, 0.0, 0.0),
-        )
+        key_T7 = _without_half_turns(np.array([(k.time, *k.translation, *k.rotation) for k in self.keyframes]))
+        rotation_T33 = np.array([euler_rotation(triple(degrees)) for degrees in key_T7[:, 4:].tolist()])
+        return Motion(key_T7[:, 0], key_T7[:, 1:4], rotation_T33, self.position or (0.0, 0.0, 0.0))
+
+
+def _without_half_turns(key_T7: np.ndarray) -> np.ndarray:
+    """Returns rows of time, translation and rotation, with others between those 180 degrees or more apart.
+
+    Motion interpolates along the shorter way. Raises: ConfigError for large turns about several axes.
+    """
+    turn_T3 = np.abs(np.diff(key_T7[:, 4:], axis=0))
+    far_T = turn_T3.max(axis=1) >= 180
+    rule = "of rotations less than 180 degrees apart, or different in one angle"
+    require(bool((np.count_nonzero(turn_T3[far_T], axis=1) == 1).all()), "keyframes", rule, "several")
+    turns = float(turn_T3[far_T].sum()) / 360
+    require(turns <= MOST_TURNS, "keyframes", f"of at most {MOST_TURNS} turns together", turns)
+    piece_T = np.where(far_T, np.ceil(turn_T3.max(axis=1) / 120), 1).astype(int)
+    rows = zip(key_T7, key_T7[1:], piece_T, strict=False)
+    return np.concatenate([key_T7[:1], *(np.linspace(before, after, count + 1)[1:] for before, after, count in rows)])
 
 
 @dataclass(frozen=True, kw_only=True)

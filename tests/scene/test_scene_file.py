@@ -11,6 +11,7 @@ import trimesh
 import yaml
 
 from hgn.scene.material import SAND, SNOW, WATER
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene_file import load_scene
 from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError
@@ -100,6 +101,35 @@ def test_keyframes_are_poses_about_the_position(tmp_path):
     middle = cone.motion.place(np.array([CONE["position"]]), 1.0)
     assert np.allclose(middle, [[0.55, 0.2, 0.5]])
     assert np.allclose(cone.motion.place(np.array([[0.6, 0.2, 0.5]]), 2.0), [[0.6, 0.2, 0.4]])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_obstacles_turn_as_far_as_written(tmp_path, axis):
+    """Keyframes half a turn or more apart turn the obstacle at a constant rate about the axis whose angle differs."""
+    begin = np.array([10.0, 20.0, 30.0])
+    for degrees in (-1080, -190, -180, 170, 180, 190, 360, 720):
+        end = begin + degrees * np.eye(3)[axis]
+        keyframes = [{"time": 1, "rotation": begin.tolist()}, {"time": 3, "rotation": end.tolist()}]
+        (cone,) = load(tmp_path, obstacles=[{**CONE, "keyframes": keyframes}]).obstacles
+        assert cone.motion is not None and np.ptp(cone.motion.rotation_T33, axis=0).any()
+        for fraction in (0, 0.1, 0.5, 0.9, 1):
+            expected_33 = euler_rotation(tuple(begin + fraction * (end - begin)))
+            np.testing.assert_allclose(cone.motion.pose(1 + 2 * fraction)[0], expected_33, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rotations", "message"),
+    [
+        ([(0, 0, 0), (180, 1, 0)], "keyframes must be of rotations less than 180 degrees apart, or different in one"),
+        ([(0, 0, 0), (4e5, 0, 0)], "keyframes must be of at most 1000 turns together, got 1111.1"),
+        ([(-1e15, 0, 0), (1e15, 0, 0)], "keyframes must be of at most 1000 turns together, got 5.5"),
+    ],
+)
+def test_refused_keyframes(tmp_path, rotations, message):
+    """Large turns without one axis, and too many turns."""
+    keyframes = [{"time": time, "rotation": list(degrees)} for time, degrees in enumerate(rotations)]
+    with pytest.raises(ConfigError, match=message):
+        load(tmp_path, obstacles=[{**CONE, "keyframes": keyframes}])
 
 
 def test_moving_obstacles_begin_at_their_first_pose(tmp_path):
