@@ -84,7 +84,7 @@ def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
     metadata = {"license": licence, "library_name": "hgn", "tags": ["physics", "particles", "simulation", network.kind]}
     rows = {
         "network": f"{network.kind}, {network.dimensions}D, width {network.width}, {network.levels} levels",
-        "materials": ", ".join(network.materials),
+        "materials": ", ".join(info.data_materials),
         "cells": f"{network.cell_size:g}",
         "obstacles": "seen" if network.obstacle_features else "not seen",
         "frames a second": f"{info.frame_rate_hz:g}",

@@ -139,6 +139,10 @@ class SceneConfig:
         """Returns whether all scenes have the gravity of the settings."""
         return not self.kinds and self.zero_gravity_fraction == 0 and self.tilted_gravity_fraction == 0
 
+    @property
+    def drawn_materials(self) -> tuple[str, ...]:
+        return (*dict.fromkeys((*self.materials, *({"elastic"} & {*self.own_physics}))),)
+
 
 @dataclass(frozen=True)
 class MpmConfig(Bounded):
@@ -437,7 +441,7 @@ class TrainConfig:
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} if training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)
-        names = () if self.imported else (*self.scene.materials, *({"elastic"} & {*self.scene.own_physics}))
+        names = () if self.imported else self.scene.drawn_materials
         unknown = [name for name in names if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))
 

@@ -209,11 +209,11 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> Scene:
     """Returns a scene: a scene file, an example, or a random scene like those of the training."""
     if config.scene is not None:
         return load_scene(find_scene(config.scene))
-    own = [name for name in info.network.materials if name not in MATERIALS]
+    own = [name for name in info.data_materials if name not in MATERIALS]
     rule = "given with weights of imported data, which differ from random scenes"
     imported = info.network.dimensions != 3 or bool(own)
     require(not imported, "data", rule, None, "for example data=data/mine episode=validation-000000")
-    drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
+    drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.data_materials)
     if not info.network.obstacle_features:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as in conf/scene/no_obstacles.yaml
     return generate_scene(drawn, config.random_seed)

@@ -215,6 +215,11 @@ class Simulator:
         assert self._info is not None
         return self._info
 
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Returns the materials that scenes can have: those of the weights' data, or without `info` the network's."""
+        return self._info.data_materials if self._info else self.network.config.materials
+
     def start(self, scenes: Sequence[InitialState | Scene]) -> ParticleState:
         """Returns the state at frame 0, with the scenes' past frames or a ballistic history.
 
@@ -378,7 +383,7 @@ class Simulator:
         return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames=frames, inputs=inputs)
 
     def require_fits(self, scene: InitialState) -> None:
-        """Raises ConfigError if loaded weights do not fit a scene. `start` checks its materials."""
+        """Raises ConfigError if loaded weights do not fit a scene."""
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
         rule = f"the network's {dimensions}"
@@ -388,6 +393,7 @@ class Simulator:
         remedy = "use weights=own_physics, leave keyframes out, or run datagen.solve"
         rule = "at rest for a network without `moving` in network.own_physics"
         require(known or not scene.moving, "obstacles", rule, "keyframes", remedy=remedy)
+        material_rows(scene.material_N, self.materials, scene.materials)
         if info is None:
             return
         if info.network.relative:

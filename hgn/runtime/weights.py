@@ -56,10 +56,15 @@ class WeightsInfo(Bounded):
     maximum_initial_speed: NonNegative[float] | None = None
     # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
     own_ranges: dict[str, Range] = field(default_factory=dict)
+    materials: tuple[str, ...] = ()  # materials of the data; empty: all of the network's
     format_version: int = FORMAT_VERSION
     step: StepConfig = field(default_factory=StepConfig)  # constraints of each frame
     updates: NonNegative[int] = 0  # number of updates of the training
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
+
+    @property
+    def data_materials(self) -> tuple[str, ...]:
+        return self.materials or self.network.materials
 
 
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:

@@ -60,6 +60,7 @@ class DataInfo(Bounded):
     maximum_initial_speed: NonNegative[float] | None = None  # of the groups, domain units per second; None: unknown
     # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
     own_ranges: dict[str, Range] = field(default_factory=dict)
+    materials: tuple[str, ...] = ()  # materials of the data; empty: all of the network's
 
 
 @dataclass(frozen=True)

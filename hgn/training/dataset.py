@@ -70,8 +70,8 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     require(stored["frame_rate_hz"] == rate, field, f"data with {rate:g} frames per second", stored["frame_rate_hz"])
     cell_size = config.scene.cell_size
     require(scene.cell_size == cell_size, field, f"data with cells of {cell_size:g}", scene.cell_size)
-    known_materials = set(scene.materials) <= set(network.materials)
-    require(known_materials, field, f"data with only {', '.join(network.materials)}", list(scene.materials))
+    known_materials = set(scene.drawn_materials) <= set(network.materials)
+    require(known_materials, field, f"data with only {', '.join(network.materials)}", list(scene.drawn_materials))
     seen = network.obstacle_features or scene.obstacle_count == 0
     require(seen, field, "data without obstacles, which the network does not see", folder)
     upright = scene.gravity == config.scene.gravity and scene.upright

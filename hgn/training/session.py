@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 import yaml
 
-from hgn.config import TrainConfig
+from hgn.config import SceneConfig, TrainConfig
 from hgn.data.manifest import Manifest
-from hgn.data.pooled import AnyStore
+from hgn.data.pooled import AnyStore, PooledStore
 from hgn.data.storage import faults_outlived
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
@@ -24,7 +24,7 @@ from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_re
 from hgn.runtime.torch_backend import precisions_to_try
 from hgn.scene.kinds import fastest
 from hgn.scene.own_physics import own_ranges
-from hgn.schema import printable, to_mapping
+from hgn.schema import from_stored, printable, to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.loading import loading
@@ -151,6 +151,7 @@ def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[s
         config.scene.gravity,
         maximum_initial_speed=fastest(config.scene),
         own_ranges=own_ranges(config.scene.own_physics),
+        materials=_materials(config, start.store),
     )
     network = build_network(config.network, config.step)
     module = TrainingModule(network, config.training, data, backend, precisions=precisions)
@@ -159,6 +160,15 @@ def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[s
     else:
         module.load_weights(start.initial)
     return module
+
+
+def _materials(config: TrainConfig, store: AnyStore) -> tuple[str, ...]:
+    """Returns the materials of the data. With training.init_weights, whose data had others, it returns none."""
+    if config.imported or config.training.init_weights is not None:
+        return ()
+    others = store.others if isinstance(store, PooledStore) else ()
+    scenes = (from_stored(SceneConfig, other.manifest.config["scene"], "scene") for other in others)
+    return (*dict.fromkeys(name for scene in (config.scene, *scenes) for name in scene.drawn_materials),)
 
 
 def _backend(config: TrainConfig, resume: Resume | None) -> tuple[str, tuple[str, ...], str]:

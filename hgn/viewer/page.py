@@ -282,7 +282,7 @@ class PlayPage:
 
     def _materials(self) -> tuple[str, ...]:
         """Returns the materials that can be poured: the materials of the weights that scenes can have too."""
-        return tuple(name for name in self.session.simulator.network.config.materials if name in MATERIALS)
+        return tuple(name for name in self.session.simulator.materials if name in MATERIALS)
 
     def _add_shape(self) -> None:
         size = clamped(self.size)

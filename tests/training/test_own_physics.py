@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import ballistic_solver
 import numpy as np
+import pytest
 import torch
 from equality import assert_same
 from scene.test_episode import members_of
 from training.runs import train_mapping
 
 from hgn import rollout, train
+from hgn.card import weights_card
 from hgn.config import NetworkConfig, SceneConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
@@ -21,6 +23,7 @@ from hgn.scene.moving import at_rest
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.own_physics import own_ranges
 from hgn.scene.random_scene import generate_scene
+from hgn.schema import ConfigError
 from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
@@ -33,7 +36,7 @@ MORE |= {"pushforward_scenes": 2, "pushforward_frames": 2, "maximum_updates": 8,
 def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypatch, capsys):
     """Shards keep friction and parameters. Batches have those of a simulation of the same scene. A training that is
     interrupted ends bit by bit as another. Its exported weights have the inputs and the ranges of the data, and a
-    rollout names values beyond them."""
+    rollout names values beyond them, and refuses materials that the data do not contain."""
     scenes = []
     generate = lambda config, seed: scenes.append(generate_scene(config, seed)) or scenes[-1]  # noqa: E731
     monkeypatch.setattr(ballistic_solver, "generate_scene", generate)
@@ -41,6 +44,7 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     monkeypatch.setattr(ballistic_solver, "build_obstacle_grid", grid)
     kinds = {"slope": 2.0, "column": 1.0}
     scene = SceneConfig(domain_size=(2.0, 1.5, 1.5), kinds=kinds, own_physics=OWN, particles_per_cell=0.2)
+    scene = replace(scene, materials=("sand", "snow"))
     config = replace(make_config(training_scenes=12, seed=1), scene=scene)
     store = EpisodeStore(make_dataset(config), "train")
     episodes = [store[i] for i in range(12)]
@@ -105,3 +109,9 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     assert "friction: 1.5, the data of own have 0 to 1; motion is unreliable" in said
     assert "sand_friction_angle_deg: 60, the data of own have 15 to 45" in said
     assert "no effect: poisson_ratio of groups" in said and "no effect: friction" not in said
+
+    (tmp_path / "wet.yaml").write_text(f"groups: [{group.replace('sand, sand_friction_angle_deg: 60', 'water')}}}]\n")
+    assert network.config.materials == ("water", "sand", "snow")
+    with pytest.raises(ConfigError, match=r"material must be one of the network's \(sand, snow\), got water; use"):
+        rollout.main(out | {"scene": str(tmp_path / "wet.yaml")})
+    assert "| materials | sand, snow |" in weights_card(info, "own", file.name, "mit")
