@@ -27,6 +27,7 @@ from hgn.system.patience import UnreachableError
 CACHE_VARIABLE = "HGN_CACHE"
 LIMIT_VARIABLE = "HGN_CACHE_GB"
 _LOCK_PAUSE_S = 0.05
+_STALLED_S = 2.0  # a process that has a lock and writes nothing for this time may be suspended
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -176,7 +177,7 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
     """Yields the locked partial file of `path` with the bytes that earlier processes wrote; None once `path` exists.
 
     The kernel frees the lock of a process that ends, so the next process continues the file.
-    Raises: UnreachableError if another process has the lock and writes nothing for `patience_s`.
+    Raises: UnreachableError if another process has the lock and writes nothing for `patience_s` or _STALLED_S.
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
@@ -201,14 +202,14 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
 
 
 def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> None:
-    """Locks a file. Waits for another process as long as the file grows; one that does not write may be suspended."""
+    """Locks a file. Waits for another process as long as the file grows, and then for `patience_s` or _STALLED_S."""
     size, start = -1, time.monotonic()
     try:
         while not lock_file(file):
             before, size = size, os.fstat(file.fileno()).st_size
             if before != size:
                 start = time.monotonic()
-            if time.monotonic() - start >= patience_s or patience.without.is_set():
+            if time.monotonic() - start >= max(patience_s, _STALLED_S) or patience.without.is_set():
                 raise UnreachableError(url, patience_s, "another process is fetching it")
             patience.without.wait(_LOCK_PAUSE_S)
     except OSError as error:

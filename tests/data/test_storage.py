@@ -20,6 +20,7 @@ from serving import serving
 import hgn.data.storage
 from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState
+from hgn.data import shard_cache
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, cache_folder
@@ -333,9 +334,10 @@ def test_server_that_is_away_is_not_asked_at_once_again(folder, serve, monkeypat
     assert not store.refresh() and same_episodes(store.of_split("validation"), EpisodeStore(folder, "validation"))
 
 
-def test_what_is_within_reach(folder, serve, cache):
-    """Who would rather go on than wait asks first: a server that is away, or a shard that another process is fetching,
-    is no; what is here, or comes at once, is yes."""
+def test_what_is_within_reach(folder, serve, cache, monkeypatch):
+    """Who would rather go on than wait asks first: a server that is away, or a shard that a stopped process is
+    fetching, is no; what is here, comes at once, or is just fetched by another process, is yes."""
+    monkeypatch.setattr(shard_cache, "_STALLED_S", 0.1)
     url = serve()
     store = EpisodeStore(url, "train")
     assert store.within_reach([0, 1], patience_s=0)
@@ -343,6 +345,8 @@ def test_what_is_within_reach(folder, serve, cache):
     with partial_of(third, cache).open("wb") as partial:
         fcntl.flock(partial, fcntl.LOCK_EX)
         assert not store.within_reach([2], patience_s=0)
+        monkeypatch.setattr(shard_cache.patience.without, "wait", lambda _: partial.close())
+        assert store.within_reach([2], patience_s=0)
     serve.stop()
     assert store.within_reach([0, 1], patience_s=0) and not store.within_reach([1, 4], patience_s=0)
     assert EpisodeStore(folder, "train").within_reach(range(5), patience_s=0)
