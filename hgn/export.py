@@ -48,6 +48,9 @@ class ExportConfig:
         require(given, "checkpoint", "given, or weights instead", self.checkpoint)
         require(self.checkpoint is None or self.weights is None, "weights", "null with checkpoint", self.weights)
         require(self.checkpoint is None or self.out is not None, "out", "given with checkpoint", self.out)
+        named = self.out is None or self.out.endswith(".safetensors")
+        remedy = "onnx=, package= and arrays= write other formats"
+        require(named, "out", "a .safetensors name", self.out, remedy=remedy)
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
         for name, value in self.step_changes.items():
             require(self.out is not None, name, "null without out, the file that it changes", value)

@@ -30,6 +30,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.scene.rollout_file import read_rollout
 
 # command, arguments, message
+OUT = "out=x.safetensors"
 VALUES = [
     ("datagen", ["scenes=abc"], "dataset.training_scenes must be a whole number, got 'abc' (str)"),
     ("datagen", ["colour=1"], "colour is not a known key; known keys: "),
@@ -101,11 +102,12 @@ VALUES = [
         for name in ("hf:/a/b", "hf:a/b", "hf//a/b", "hff://a/b")
     ),
     ("rollout", [*ROLLOUT, "weights=weight.safetensors"], "got weight.safetensors; did you mean weights.safetensors?"),
-    ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
-    ("export", ["checkpoint=.", "out=x"], "checkpoint must be an existing file, got .; hgn.train writes one"),
-    ("export", ["checkpoint=run", "out=x"], "checkpoint must be an existing file, got run; use run/checkpoints/"),
-    ("export", ["checkpoint=run/checkpoints/bst.ckpt", "out=x"], "bst.ckpt; did you mean best.ckpt?"),
+    ("export", ["checkpoint=none.ckpt", OUT], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
+    ("export", ["checkpoint=.", OUT], "checkpoint must be an existing file, got .; hgn.train writes one"),
+    ("export", ["checkpoint=run", OUT], "checkpoint must be an existing file, got run; use run/checkpoints/"),
+    ("export", ["checkpoint=run/checkpoints/bst.ckpt", OUT], "bst.ckpt; did you mean best.ckpt?"),
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
+    ("export", ["checkpoint=none.ckpt", "out=a.onnx"], "out must be a .safetensors name, got 'a.onnx'; onnx="),
     ("export", ["out=x"], "checkpoint must be given, or weights instead, got None"),
     ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
     ("rollout", ["--weights=mechanics"], "--weights=mechanics is not an option; settings are given as weights=mec"),
