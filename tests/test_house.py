@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_379,
+    "hgn": 34_424,
     "datagen": 8_919,
     "tools": 6_302,
-    "tests": 35_628,
+    "tests": 35_687,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

@@ -3,8 +3,10 @@
 Pages that are notebooks run in test_notebooks.py.
 """
 
+import gc
 import shutil
 import signal
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from omegaconf import OmegaConf
 from processes import PATIENCE_S, free_port
 
 from datagen.generate import datagen_config
+from hgn.data.reader import EpisodeStore
 from hgn.scene.scene_file import load_scene
 
 TUTORIALS = ROOT / "docs" / "tutorials"
@@ -147,8 +150,18 @@ def test_network(here):
     assert (runner.names["changed"].speed.weight.grad != 0).any()
 
 
-def test_how_to(here):
-    """How-to pages: the check of a data set's shards, which sees a flipped bit, and the scene file's example."""
+def test_how_to(here, capsys):
+    """How-to pages: the check of a data set's shards, which sees a flipped bit, and the scene file's example. The loop
+    of data.md reads all training episodes."""
+    (loop,) = [block for block in blocks_of(ROOT / "docs/concepts/data.md") if "webdataset" in block.content]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # WebDataset does not close shards
+        exec(loop.content.replace("data/obstacles", "data/mine"), {})
+        gc.collect()
+    assert capsys.readouterr().out.splitlines() == [
+        f"{episode.key} {episode.position_TN3.shape} {[*episode.gravity]}"
+        for episode in EpisodeStore("data/mine", "train")
+    ]
     (check,) = [block for block in blocks_of(ROOT / "docs/how_to/verify_shards.md") if block.language == "python"]
     code = check.content.replace("data/obstacles", "data/mine")
     exec(code, {})
