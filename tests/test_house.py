@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_424,
-    "datagen": 8_919,
+    "datagen": 8_918,
     "tools": 6_302,
-    "tests": 35_687,
+    "tests": 35_689,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 
