@@ -47,7 +47,7 @@ def main(mapping: dict[str, Any]) -> int:
     require_place(out)
     require_replaceable("out", out)
     scene = load_scene(file)
-    for note in notes_on_files(scene):
+    for note in notes_on_files(scene, (config.frames - 1) / config.frame_rate_hz):
         print(note, file=sys.stderr)
     with space_reserved(out, rollout_bytes(config.frames, scene.particle_count)):
         rollout = solved(scene, config, file)

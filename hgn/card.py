@@ -42,7 +42,7 @@ class CardConfig:
     def __post_init__(self) -> None:
         one = (self.weights is None) != (self.data is None)
         require(one, "weights", "given, or data, but not both", [self.weights, self.data])
-        rule = "a folder, given together with weights"
+        rule = "a folder, given with weights, and left out with data, whose folder it is"
         require((self.weights is None) == (self.out is None), "out", rule, self.out)
         plain = re.fullmatch(r"[a-z0-9.-]+", self.license) is not None
         require(plain, "license", "the Hub's name of a licence, for example mit or cc-by-4.0", self.license)

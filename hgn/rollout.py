@@ -146,7 +146,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
-        notes = notes_on_scene(scene, simulator.info, weights.stem)
+        notes = notes_on_scene(scene, simulator.info, weights.stem, (frames - 1) / simulator.frame_rate_hz)
         source["scene"] = config.scene or f"random, seed {config.random_seed}"
     else:
         from hgn.data.reader import find_episode

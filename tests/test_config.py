@@ -138,7 +138,7 @@ RULES = {
     command(RenderConfig, rollout="r", out="o"): [
         ({"rollout": None}, "rollout must be a file, or else data and episode given"),
         ({"data": "folder"}, "rollout must be left out where data and episode are given"),
-        ({"names": ["a", "b"]}, "names must be 1 different ones"),
+        ({"names": ["a", "b"]}, "names must be 1 different ones, of rollout and of each of the 0 others, got"),
         ({"every": 0}, "every must be at least 1"),
         ({"size": 10}, "size must be 64 to 4096 pixels"),
         ({"colour": "red"}, "colour is not a known key"),

@@ -61,7 +61,7 @@ class RenderConfig:
             require(not any(given), "rollout", "left out where data and episode are given", self.rollout)
         if self.names is not None:
             count = 1 + len(self.others)
-            rule = f"{count} different ones, of rollout and of each of others"
+            rule = f"{count} different ones, of rollout and of each of the {count - 1} others"
             require(len(set(self.names)) == len(self.names) == count, "names", rule, self.names)
         require(64 <= (self.size or 64) <= 4096, "size", "64 to 4096 pixels", self.size)
 

@@ -1,5 +1,6 @@
 """Notes on scenes that weights cannot simulate as their solver would: ignored settings, and values outside the data."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,9 +14,9 @@ from hgn.scene.scene_notes import notes_on_files
 SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; velocities are stored in float32
 
 
-def notes_on_scene(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[str]:
+def notes_on_scene(scene: Scene, info: WeightsInfo, weights: str, duration_s: float = math.inf) -> Iterator[str]:
     """Yields a line for each note on the files of a scene and on physics that the weights do not support."""
-    yield from notes_on_files(scene)
+    yield from notes_on_files(scene, duration_s)
     inputs = info.network.own_physics
     used = INPUT_PARAMETERS if "parameters" in inputs else ()
     if unused := ", ".join(name for name in scene.material_parameters if name not in used):
@@ -32,7 +33,8 @@ def notes_on_scene(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[st
         values = own.get(name, scene.material_parameters.get(name, np.zeros(0)))
         far = values[(values < low * (1 - SAME_SPEED)) | (values > high * (1 + SAME_SPEED))]
         if len(far) and name in (*used, *inputs):
-            yield f"{name}: {far[0]:.4g}, the data of {weights} have {low:g} to {high:g}; motion is unreliable"
+            field = "keyframes, domain units per second" if name == "moving" else name
+            yield f"{field}: {far[0]:.4g}, the data of {weights} have {low:g} to {high:g}; motion is unreliable"
 
 
 def note_on_speed(velocity_N3: np.ndarray, info: WeightsInfo, weights: str) -> Iterator[str]:

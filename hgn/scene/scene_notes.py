@@ -1,5 +1,6 @@
 """Warnings about a scene's file: groups in one place, sheets, and obstacles out of reach."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from hgn.scene.barrier import barrier_pieces
 from hgn.scene.distance import contains, extent
 from hgn.scene.group import Region, region_of
+from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS
 from hgn.scene.motion import AT_REST
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.scene_file import MILLIMETRES
@@ -16,12 +18,12 @@ OVERLAP = 0.01  # smallest overlap that is noted, as a fraction of the smaller g
 OVERLAP_SAMPLES = 1000  # number of particles of a group that are searched for overlaps
 
 
-def notes_on_files(scene: Scene) -> list[str]:
-    """Returns warnings about groups in one place, sheets, obstacles tiny or without a surface in the domain, and
-    particles inside one."""
+def notes_on_files(scene: Scene, duration_s: float = math.inf) -> list[str]:
+    """Returns warnings about entries without effect in a simulation of `duration_s`, groups in one place, sheets,
+    obstacles tiny or without a surface in the domain, and particles inside one."""
     if scene.specification.get("kind") != "file":
         return []
-    notes = [*_overlaps(scene)]
+    notes = [*_overlaps(scene), *_without_effect(scene, duration_s)]
     entries = scene.specification["obstacles"]
     for sheet in scene.obstacles[len(entries) :]:
         notes.append(f"{len(sheet.triangle_F3)} triangles are a sheet, because they enclose no volume: {sheet.name}")
@@ -50,6 +52,18 @@ def notes_on_files(scene: Scene) -> list[str]:
         elif np.ptp(begin.vertex_V3, axis=0).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name}; see {key}")
     return [printable(note) for note in notes]
+
+
+def _without_effect(scene: Scene, duration_s: float) -> Iterator[str]:
+    for name in ("groups", "emitters"):
+        for index, entry in enumerate(scene.specification.get(name, ())):
+            material = entry["material"]
+            for key in MATERIAL_PARAMETERS:
+                other = key.partition("_")[0]
+                if entry.get(key) is not None and other in MATERIALS and other != material:
+                    yield f"no effect: {key} of {name}[{index}], which is {material}"
+            if entry.get("start", 0) > duration_s:
+                yield f"no effect: {name}[{index}], because it starts after the last frame"
 
 
 def _overlaps(scene: Scene) -> Iterator[str]:

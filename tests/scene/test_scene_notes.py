@@ -38,6 +38,22 @@ def test_groups_in_one_place_are_noted(tmp_path):
     assert inside.startswith("groups[4] (sphere of snow) overlaps groups[3] (cube of sand): 100% of the smaller one")
 
 
+def test_entries_without_effect_are_noted(tmp_path):
+    """Constants of another material, and emitters that start after the last frame."""
+    constants = {"sand_friction_angle_deg": 30, "youngs_modulus_pa": 1e4}
+    cube = {"shape": "cube", "size": 0.1}
+    groups = [cube | {"material": name, "position": [x, 0.5, 0.5]} for name, x in (("sand", 0.5), ("snow", 0.2))]
+    emitter = {"shape": "disc", "size": 0.1, "position": [0.5, 0.8, 0.5], "velocity": [0, -1, 0], "material": "water"}
+    emitters = [emitter | {"start": 0.4, "stop": 1}, emitter | {"start": 0.6, "stop": 1, "snow_hardening": 5}]
+    scene = load(tmp_path, groups=[group | constants for group in groups], emitters=emitters)
+    constants = [
+        "no effect: sand_friction_angle_deg of groups[1], which is snow",
+        "no effect: snow_hardening of emitters[1], which is water",
+    ]
+    assert notes_on_files(scene) == constants
+    assert notes_on_files(scene, 0.5) == [*constants, "no effect: emitters[1], because it starts after the last frame"]
+
+
 @pytest.mark.parametrize("inside", [0, 1, 7])
 def test_stored_particles_inside_an_obstacle(tmp_path, inside):
     """They are noted with their number, for obstacles of any kind; an empty file is refused."""

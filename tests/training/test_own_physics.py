@@ -101,13 +101,16 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     assert torch.equal(state.obstacles.rows(friction=True), started.obstacles.rows(friction=True))
     assert torch.equal(network(state), network_of_checkpoint(read_checkpoint(last), last)(state))
 
+    way = "keyframes: [{time: 0}, {time: 0.1, translation: [0.2, 0, 0]}]"
+    fast = f"obstacles: [{{shape: square, size: 0.1, position: [0.3, 0.2, 0.5], {way}}}]\n"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, sand_friction_angle_deg: 60"
-    (tmp_path / "steep.yaml").write_text(f"groups: [{group}, poisson_ratio: 0.3}}]\nfloor_friction: 1.5\n")
+    (tmp_path / "steep.yaml").write_text(f"groups: [{group}, poisson_ratio: 0.3}}]\nfloor_friction: 1.5\n{fast}")
     out = {"weights": str(file), "frames": 2, "scene": str(tmp_path / "steep.yaml"), "out": str(tmp_path / "a.vtkhdf")}
     assert rollout.main(out) == 0
     said = capsys.readouterr().err
     assert "friction: 1.5, the data of own have 0 to 1; motion is unreliable" in said
     assert "sand_friction_angle_deg: 60, the data of own have 15 to 45" in said
+    assert "keyframes, domain units per second: 2, the data of own have 0 to 1; motion is unreliable" in said
     assert "no effect: poisson_ratio of groups" in said and "no effect: friction" not in said
 
     (tmp_path / "wet.yaml").write_text(f"groups: [{group.replace('sand, sand_friction_angle_deg: 60', 'water')}}}]\n")
