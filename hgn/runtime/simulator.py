@@ -10,7 +10,6 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import physics_fields
 from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate, with_velocities
-from hgn.runtime.divergence import DivergedError
+from hgn.runtime.divergence import DivergedError, diverged
 from hgn.runtime.simulation import Entry, Simulation, on_host
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.torch_stepper import stepped
@@ -41,7 +40,7 @@ from hgn.scene.moving import MovingObstacle, at_rest, moving_obstacles, moving_o
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
-from hgn.scene.scene import Scene, all_corners, require_particles, whole_cells
+from hgn.scene.scene import Scene, all_corners, require_particles, require_vectors, whole_cells
 from hgn.schema import require, require_count
 from hgn.system.device import choose_device
 
@@ -73,10 +72,7 @@ class InitialState:
 
     def __post_init__(self) -> None:
         require_particles(self.position_N3, self.velocity_N3, self.material_N, self.materials)
-        for name, least in (("gravity", -1e9), ("domain_size", 0)):
-            value = getattr(self, name)
-            fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)  # type: ignore[operator]
-            require(fits, name, "three numbers of at most 1e9", value)
+        require_vectors(self)
         count = len(self.position_N3)
         for name, axis in (("parameters", 0), ("body_N", 0), ("past_HN3", 1)):
             shape = np.shape(getattr(self, name))
@@ -225,7 +221,8 @@ class Simulator:
 
         Raises: ConfigError if a scene has a material that the network was not trained with. For loaded weights it is
         also raised for obstacle cells of another size and for an unsupported gravity. Absolute inputs support only the
-        gravity of their data; relative inputs support up to LARGEST_GRAVITY.
+        gravity of their data; relative inputs support up to LARGEST_GRAVITY. Particles may be at most the domain's size
+        away from it.
         """
         config, states = self.network.config, initial_states(scenes)
         for state in states:
@@ -240,7 +237,7 @@ class Simulator:
         if clearance is not None:
             barriers = Barriers.of([state.barrier(clearance) for state in states])
         physics = physics_fields(config, states, material_N)
-        return ParticleState(
+        start = ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
             material_N=material_N.to(self.device),
@@ -252,6 +249,10 @@ class Simulator:
             moving=self.moving(states, [0] * len(states)),
             **{name: tensor.to(self.device) for name, tensor in physics.items()},
         )
+        far_N = diverged(start.position_N3, start.domain_S3[start.scene_N])
+        rule = "finite and no farther from the domain than its own size"
+        require(not bool(far_N.any()), "position_N3", rule, start.position_N3[far_N][:1].flatten().tolist())
+        return start
 
     def obstacles(self, scenes: Sequence[InitialState]) -> ObstacleCells | None:
         """Returns the obstacle cells of scenes on the device, or None for a network without obstacle features."""

@@ -72,7 +72,8 @@ def load_bodies(
     path = Path(path)
     require(0 < scale < np.inf, f"{field}: scale", "a finite number > 0", scale)
     for name, value in (("translation", translation), ("rotation", rotation)):
-        require(bool(np.isfinite(value).all()), f"{field}: {name}", "three finite numbers", value)
+        fits = np.shape(value) == (3,) and bool(np.isfinite(value).all())
+        require(fits, f"{field}: {name}", "three finite numbers", value)
     vertex_V3, triangle_F3 = _read(path, field)
     bad = np.flatnonzero(~np.isfinite(vertex_V3).all(axis=1))
     if len(bad):

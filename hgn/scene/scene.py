@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
+from hgn.config import MpmConfig
 from hgn.scene.kinds import require_few_cells
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
@@ -86,6 +88,14 @@ def require_particles(
     require_materials("material_N", material_N, materials)
 
 
+def require_vectors(owner: Any) -> None:
+    """Checks gravity, the domain's size and friction of walls. Raises: ConfigError unless they are three numbers."""
+    for name, least in (("gravity", -1e9), ("domain_size", 0), ("wall_friction", 0)):
+        value = getattr(owner, name)
+        fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)  # type: ignore[operator]
+        require(fits, name, f"three numbers from {least:g} to 1e+09", value)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A scene: the input of the solver and of a network's rollout."""
@@ -116,15 +126,19 @@ class Scene:
             bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
             if len(bad):
                 raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
-        frictions = {f"obstacles[{i}].friction": o.friction for i, o in enumerate(self.obstacles)}
-        frictions |= {f"wall_friction[{i}]": friction for i, friction in enumerate(self.wall_friction)}
-        for name, friction in frictions.items():
-            require(friction is None or 0 <= friction < math.inf, name, "finite and >= 0", friction)
+        require_vectors(self)
+        for i, obstacle in enumerate(self.obstacles):
+            fits = obstacle.friction is None or 0 <= obstacle.friction < math.inf
+            require(fits, f"obstacles[{i}].friction", "finite and >= 0", obstacle.friction)
         for name, value in self.material_parameters.items():
             if name not in MATERIAL_PARAMETERS:
                 raise ConfigError(f"material_parameters must be among {', '.join(MATERIAL_PARAMETERS)}, got {name!r}")
-            if value.shape != (count,):
-                raise ConfigError(f"material_parameters[{name}] must have shape {(count,)}, got {value.shape}")
+            shape = value.shape if isinstance(value, np.ndarray) else value
+            require(shape == (count,), f"material_parameters[{name}]", f"an array of shape {(count,)}", shape)
+            known = value[~np.isnan(value)]
+            for constant in (known.min(), known.max()) if len(known) else ():
+                own: dict[str, Any] = {name: float(constant)}
+                MpmConfig(**own)  # validates the constant
         if self.entry_s_N is not None:
             require(self.entry_s_N.shape == (count,), "entry_s_N", f"of shape {(count,)}", self.entry_s_N.shape)
             ordered = bool((np.diff(self.entry_s_N, prepend=0.0) >= 0).all()) and np.isfinite(self.entry_s_N).all()

@@ -16,7 +16,7 @@ import numpy as np
 from hgn.config import is_mesh_file
 from hgn.scene.rotation import rotate, round_to_float32
 from hgn.scene.scene import Obstacle
-from hgn.schema import Vector
+from hgn.schema import Vector, require
 
 CLOSED_SHAPES = frozenset({"cone", "pyramid"})
 SEGMENTS = 32  # number of segments around a cone
@@ -35,8 +35,10 @@ def shape_obstacle(
     `size` is in domain units. It is the side of the square and of the half box, the diameter of the half sphere, and
     the base width and height of cone and pyramid. The half box is half as high. A mesh file's bounding box has `size`
     as its longest side. Vertices are rounded to float32.
-    Raises: KeyError for a shape neither in hgn.config.OBSTACLE_SHAPES nor a file; ConfigError for an unreadable mesh.
+    Raises: KeyError for a shape neither in hgn.config.OBSTACLE_SHAPES nor a file; ConfigError for a size <= 0 or an
+    unreadable mesh.
     """
+    require(0 < size < math.inf, "size", "finite and > 0", size)
     vertex, triangle, closed = unit_shape(shape)
     scaled = size * vertex
     turned = scaled if rotation_33 is None else rotate(scaled, rotation_33)

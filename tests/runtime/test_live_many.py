@@ -112,7 +112,7 @@ def test_what_is_refused_changes_nothing():
             (lambda: live.reset(1, emitting), "emitters must be left out here"),
             (lambda: LiveSimulation(simulator, []), "scenes must be at least one, got 0"),
             (lambda: LiveSimulation(simulator, [None]), "scene must be a Scene or an InitialState, got 'NoneType'"),
-            (lambda: live.set_gravity((0.0, 1.0)), r"gravity must be three numbers of at most 1e9, got \(0.0, 1"),
+            (lambda: live.set_gravity((0.0, 1.0)), r"gravity must be three numbers from .* to .*, got \(0.0, 1"),
             (lambda: live.set_gravity((0.0, np.nan, 0.0)), "gravity must be three numbers"),
             (lambda: live.set_gravity((0.0, 10**400, 0.0)), "gravity must be three numbers"),
             (lambda: LiveSimulation(None, [first]), "simulator must be a Simulator, got 'NoneType'"),

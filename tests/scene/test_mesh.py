@@ -184,7 +184,7 @@ REFUSED = [
         for scale in (0.0, -1.0, np.nan, np.inf)
     ),
     ("a.obj", GOOD, {"translation": (0.0, np.nan, 0.0)}, "ramp: translation must be three finite numbers"),
-    ("a.obj", GOOD, {"rotation": (np.inf, 0.0, 0.0)}, "ramp: rotation must be three finite numbers"),
+    *(("a.obj", GOOD, {"rotation": x}, "rotation must be three finite") for x in ((np.inf, 0.0, 0.0), (90.0, 0.0))),
 ]
 
 
