@@ -117,9 +117,10 @@ class LiveSimulation:
     ) -> np.ndarray:
         """Adds particles with default parameters and a history of free flight. `material_A` are indices into MATERIALS.
 
-        Positions are in domain units, velocities in domain units per second. Returns the particles' velocity histories,
-        float32 [A, M, 3] in domain units per frame, newest first. Raises: ConfigError for a material that the network
-        was not trained with, and for arrays of different lengths.
+        Positions are in domain units, velocities in domain units per second. Particles inside obstacles, and up to the
+        domain's size outside, are accepted. Returns the particles' velocity histories, float32 [A, M, 3] in domain
+        units per frame, newest first. Raises: ConfigError for positions farther outside, for a material that the
+        network was not trained with, and for arrays of different lengths.
         """
         self._require_scene(index)
         require(index not in self.ended, "index", "the index of a scene in progress", index, remedy="reset it")

@@ -98,7 +98,10 @@ def require_vectors(owner: Any) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene: the input of the solver and of a network's rollout."""
+    """A scene: the input of the solver and of a network's rollout.
+
+    Unlike a scene file, it accepts particles inside closed obstacles and near walls. The solver refuses those at walls.
+    """
 
     position_N3: np.ndarray  # float32, domain units
     velocity_N3: np.ndarray  # float32, domain units per second
