@@ -49,7 +49,7 @@ class Motion:
 
     @staticmethod
     def of_frames(keyframes: Keyframes, pivot: Vector) -> Motion:
-        """Returns a motion without rotation."""
+        """Returns a motion without rotation: times in seconds with translations in domain units."""
         times, translations = zip(*keyframes, strict=True)
         rotation_T33 = np.tile(np.eye(3), (len(times), 1, 1))
         return Motion(np.array(times, np.float64), np.array(translations, np.float64), rotation_T33, pivot)

@@ -35,7 +35,7 @@ def quaternion_product(
 
 
 def euler_rotation(degrees: Vector) -> np.ndarray:
-    """Returns the matrix, float64 [3, 3], of turns about the fixed x axis, then y, then z.
+    """Returns the matrix, float64 [3, 3], of turns in degrees about the fixed x axis, then y, then z.
 
     Quarter turns are exact, so an axis-aligned mesh stays axis-aligned.
     """
