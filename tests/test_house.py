@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_440,
-    "datagen": 8_918,
+    "hgn": 34_468,
+    "datagen": 8_917,
     "tools": 6_302,
-    "tests": 35_708,
+    "tests": 35_728,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

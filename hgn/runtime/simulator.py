@@ -40,8 +40,8 @@ from hgn.scene.moving import MovingObstacle, at_rest, moving_obstacles, moving_o
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
-from hgn.scene.scene import Scene, all_corners, require_particles, require_vectors, whole_cells
-from hgn.schema import require, require_count
+from hgn.scene.scene import Obstacle, Scene, all_corners, require_particles, require_vectors, whole_cells
+from hgn.schema import Vector, require, require_count, triple
 from hgn.system.device import choose_device
 
 LARGEST_GRAVITY = 98.0  # largest supported gravity, domain units per second squared
@@ -112,15 +112,16 @@ class InitialState:
         Raises: ConfigError if the domain is not a whole number of solver cells, which the solver refuses too.
         """
         whole_cells(scene.domain_size, scene.cell_size)
-        first, still = at_start(scene), at_rest(scene.obstacles)
+        first, own = at_start(scene), (at_rest(scene.obstacles), scene.cell_size, scene.seed, triple(scene.domain_size))
+        grid, corners = _at_rest(*own)
         return InitialState(
             position_N3=first.position_N3,
             velocity_N3=first.velocity_N3,
             material_N=first.material_N,
-            obstacle_grid=build_obstacle_grid(still, scene.cell_size, scene.seed, scene.domain_size),
+            obstacle_grid=grid,
             domain_size=scene.domain_size,
             gravity=scene.gravity,
-            corners=lambda: all_corners(still),
+            corners=corners,
             emitting=scene if scene.emits else None,
             wall_friction=scene.wall_friction,
             parameters=input_parameters(first.material_parameters, {}, first.particle_count),
@@ -408,6 +409,15 @@ class Simulator:
         if info.network.obstacle_features:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the obstacle cells in their data"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
+
+
+@functools.lru_cache(maxsize=1)
+def _at_rest(
+    obstacles: tuple[Obstacle, ...], cell_size: float, seed: int, domain_size: Vector
+) -> tuple[ObstacleGrid, Callable[[], np.ndarray]]:
+    """Returns cells and corners of obstacles at rest. They stay the same objects while others move."""
+    grid = build_obstacle_grid(obstacles, cell_size, seed, domain_size)
+    return grid, lambda: all_corners(obstacles)
 
 
 def initial_states(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:

@@ -268,3 +268,15 @@ def test_a_program_moves_obstacles():
         pytest.raises(ConfigError, match="number must be left out: the scene has no obstacles with keyframes, got 0"),
     ):
         live.move_obstacle(0, (0.1, 0.1, 0.1))
+
+
+def test_obstacles_at_rest_are_sampled_once():
+    """Scenes with the same obstacles at rest have the same cells and corners, which live scenes do not prepare again;
+    with other obstacles, seeds or cells they have their own."""
+    scene, (still,) = scene_of(yaml.safe_load(SCENE), "a.yaml"), plates([(0.0, 0.0, 0.0)])
+    scene, plate = replace(scene, obstacles=(replace(still, motion=None),)), scene.obstacles[0]
+    first, second = map(InitialState.of, (scene, replace(scene, obstacles=(*scene.obstacles, plate))))
+    assert first.obstacle_grid is second.obstacle_grid and first.corners is second.corners and second.moving
+    lower = replace(scene, obstacles=(shape_obstacle("square", 0.2, (0.5, 0.4, 0.5)),))
+    for other in (lower, replace(scene, seed=1), replace(scene, cell_size=1 / 32)):
+        assert InitialState.of(other).obstacle_grid is not first.obstacle_grid
