@@ -238,7 +238,7 @@ def find_scene(name: str) -> Path:
 
     Raises: ConfigError for a name without suffix that is neither a file nor an example.
     """
-    if Path(name).is_file() or not re.fullmatch(r"\w+", name):
+    if Path(name).is_file() or not re.fullmatch(r"\w*", name):
         return Path(name)
     files = scene_files("example") | scene_files("gallery")
     own = f"did you mean {name}.yaml?" if Path(f"{name}.yaml").is_file() else known_keys(name, files, "examples")

@@ -49,6 +49,7 @@ VALUES = [
     ("service", ["host=no..host"], "host and port must be available, got no..host:8000 ("),
     ("service", ["out=http://localhost:1"], "out must be a folder to write to, got 'http://localhost:1'"),
     ("service", ["out=data", "port=0", "dataset.seed=7"], "contains another data set: frames is 6 there"),
+    ("solve", ["scene="], "scene must be a YAML file or the name of an example, got ''; examples: "),
     ("solve", ["scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
     ("solve", ["scene=scene.yaml", "mpm.snow_hardning=5"], "mpm.snow_hardning is not a known key; did you mean snow_h"),
     ("upload", ["data=data", "to=data"], "to must be a URL, got"),
