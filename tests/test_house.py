@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_468,
-    "datagen": 8_917,
+    "datagen": 8_929,
     "tools": 6_302,
-    "tests": 35_728,
+    "tests": 35_737,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

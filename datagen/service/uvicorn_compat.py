@@ -4,6 +4,7 @@
 """
 
 import asyncio
+import logging
 from functools import partial
 from typing import Any, BinaryIO, cast
 
@@ -26,6 +27,15 @@ class _Length:
         return self._count
 
 
+class _NamedLogger(logging.LoggerAdapter[logging.Logger]):
+    """Begins messages with the address of a client."""
+
+    level = logging.WARNING
+
+    def process(self, msg: Any, kwargs: Any) -> tuple[str, Any]:
+        return f"{dict(self.extra or {})['address']}: {msg}", kwargs
+
+
 class SendfileProtocol(H11Protocol):
     """Adds `http.response.zerocopysend` and time limits to Uvicorn's HTTP on asyncio's own loop.
 
@@ -44,6 +54,8 @@ class SendfileProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        address = str((self.client or ("unknown",))[0]).partition("%")[0]
+        self.logger = cast(Any, _NamedLogger(self.logger, {"address": address}))
         self.made_at = self.loop.time()
         if len(self.connections) > self.most_connections:
             waiting = [other for other in self.connections if isinstance(other, SendfileProtocol) and not other.busy]

@@ -175,3 +175,11 @@ def test_bodies_are_refused(port):
         endless.sendall(b"GET /file HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n")
         answer = b"".join(iter(lambda: endless.recv(4096), b""))
     assert answer.startswith(b"HTTP/1.1 413") and b"uploads are not accepted" in answer
+
+
+def test_other_protocols_are_logged_with_their_address(port, caplog):
+    """A client of HTTPS gets an answer, and the log has its address."""
+    with closing(socket.create_connection(("127.0.0.1", port))) as connection:
+        connection.sendall(b"\x16\x03\x01\x02\x00\x01\r\n\r\n")
+        assert connection.recv(100).startswith(b"HTTP/1.1 400")
+    assert [record.getMessage() for record in caplog.records] == ["127.0.0.1: Invalid HTTP request received."]
