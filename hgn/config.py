@@ -362,9 +362,6 @@ class TrainingConfig:
     noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
     # fraction of the noise's variance in waves of 4 to 64 cells, which neighbours have in common; the paper's is 0
     noise_correlated_fraction: Fraction[float] = 0.1
-    # smallest scale of the noise in a frame whose rms acceleration a is below noise_std; the scale is log-uniform from
-    # max(a / noise_std, this) to 1, and the loss weight is 1 / scale^2; 1: equal noise in all frames
-    noise_min_scale: AtMostOne[Positive[float]] = 1.0
     # acceleration, domain units per frame squared; squared errors of a frame with smaller rms acceleration a are
     # multiplied by this / a, at most by 4; 0: all frames have equal loss weights
     quiet_acceleration: NonNegative[float] = 0.0

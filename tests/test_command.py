@@ -48,12 +48,12 @@ def test_names_that_hydra_refuses(given, meant, monkeypatch):
 
 def test_names_in_lists(monkeypatch):
     """Each name of a list is taken by itself; what is no name is refused."""
-    monkeypatch.setattr("sys.argv", ["average", "weights=[a, dé mo (1),3]", "out=ü", "+new=[x&y]"])
-    (composed,) = _compose("average")
+    monkeypatch.setattr("sys.argv", ["error_vs_time", "data=d", "weights=[a, dé mo (1),3]", "out=ü", "+new=[x&y]"])
+    (composed,) = _compose("error_vs_time")
     assert (composed["weights"], composed["out"], composed["new"]) == (["a", "dé mo (1)", 3], "ü", ["x&y"])
-    monkeypatch.setattr("sys.argv", ["average", "weights=[a,{ü]", "out=x"])
+    monkeypatch.setattr("sys.argv", ["error_vs_time", "data=d", "weights=[a,{ü]", "out=x"])
     with pytest.raises(ConfigError, match="weights="):
-        _compose("average")
+        _compose("error_vs_time")
 
 
 @pytest.mark.parametrize(

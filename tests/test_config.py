@@ -3,7 +3,6 @@
 import pytest
 
 from datagen.solve import SolveConfig
-from hgn.average import AverageConfig
 from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.evaluate import EvaluateConfig
 from hgn.rollout import RolloutConfig
@@ -30,10 +29,6 @@ def step_of(inputs="absolute", dimensions=3, **step):
     return TrainConfig(
         network=NetworkConfig(inputs=inputs, dimensions=dimensions), step=StepConfig(**step), imported=True
     )
-
-
-def average_of(count, coefficients=None):
-    return AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)
 
 
 def kinds_of(group_count=4, **kinds):
@@ -115,11 +110,6 @@ RULES = {
         ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
         ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
         ({"pushforward_fraction": 0.5, "frames": 2}, "dataset.frames must be at least 3 if .*_fraction > 0, got 2"),
-    ],
-    average_of: [
-        ({"count": 1}, "weights must be at least two files, got 1"),
-        ({"count": 2, "coefficients": (0.5, 0.3, 0.2)}, "coefficients must be one for each of the 2 files, got 3"),
-        ({"count": 2, "coefficients": (0.7, 0.4)}, "coefficients must be numbers of sum 1, got 1.1"),
     ],
     command(BenchConfig): [
         ({"cases": ["frames"]}, r"cases\[0\] must be one of frame, torch_frame"),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from hgn.config import DatagenConfig, MpmConfig, NetworkConfig, SceneConfig, TrainConfig
+from hgn.config import DatagenConfig, MpmConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.data.identity import dataset_identity
 from hgn.network.build import build_network
 from hgn.renamed import KEYS, REMOVED, Removed, current_names, stored_names
@@ -12,7 +12,7 @@ from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, section_of, to_mapping
 from hgn.training.checkpoint import SECTION, Progress
 
-SECTIONS = (SceneConfig, MpmConfig, NetworkConfig)
+SECTIONS = (SceneConfig, MpmConfig, NetworkConfig, TrainingConfig)
 
 
 @pytest.fixture
@@ -27,6 +27,7 @@ ALWAYS = "is not a known key; it was removed and is always"
 ANSWERS = [
     ("network.depth", 4, f"network.depth {ALWAYS} 3 now, not 4; train other weights"),
     ("network.contact_gate", "cell", f"network.contact_gate {ALWAYS} cell now; leave it out"),
+    ("training.noise_min_scale", 0.1, f"training.noise_min_scale {ALWAYS} 1.0 now, not 0.1; leave it out"),
     ("network.static_spacing_cells", 1.0, "it was removed; leave it out; commit a0b88cb"),
     ("mpm.time_step", "fixed", "it was removed; mpm.fixed_time_step_s is null for adaptive steps"),
     ("mpm.sand_friction_law", "mohr_coulomb", "from mpm.method: mohr_coulomb with corrected, comp"),

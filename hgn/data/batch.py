@@ -44,7 +44,6 @@ class Batch:
     seeds_S: tuple[int, ...]  # seeds of noise, jitter and symmetry
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # symmetries of each scene that training may apply
     weight_S: tuple[float, ...] = ()  # loss weight of each scene; empty: 1
-    noise_scale_S: tuple[float, ...] = ()  # noise scale of each scene in units of training.noise_std; empty: 1
     wall_friction_S3: torch.Tensor | None = None  # as in ParticleState
     parameter_NP: torch.Tensor | None = None  # as in ParticleState
     rest: RestShape | None = None  # as in ParticleState
@@ -86,7 +85,6 @@ class BatchSample:
     window_WN3: np.ndarray  # positions around the frame, from the episode or from a simulation
     seed: int = 0  # seed of noise, jitter and symmetry
     weight: float = 1.0  # loss weight
-    noise_scale: float = 1.0  # scale of its noise in units of training.noise_std
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +130,6 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
         obstacles=ObstacleCells.of(grids),
         seeds_S=tuple(sample.seed for sample in samples),
         weight_S=tuple(sample.weight for sample in samples),
-        noise_scale_S=tuple(sample.noise_scale for sample in samples),
         symmetries_S=tuple(shown_symmetries(e, network) for e in episodes),
         moving=moving_in(samples, network),
         **physics_fields(network, episodes, material_N),

@@ -34,7 +34,6 @@ class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand ar
     frame: int
     seed: int  # seed of its noise, grid jitter and symmetry
     weight: float = 1.0  # loss weight
-    noise_scale: float = 1.0  # scale of its noise in units of training.noise_std (see hgn.training.noise)
 
 
 BLOCK_EPISODES = 8  # number of consecutive episodes in a block of the shuffle; most shards have this size

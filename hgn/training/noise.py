@@ -1,8 +1,8 @@
 """Input noise and grid jitter (paper sec. 3.3), each drawn from the sample's own seed.
 
-`noise_scale` returns the scale of a sample's noise for both backends. Backend torch draws the noise in this module
-(`perturbed_window`, called by hgn.training.torch_updates). Backend triton draws it in hgn.kernels.update
-(`Updates._assemble`, kernels `draw_waves` and `assemble_batch`).
+Backend torch draws the noise in this module (`perturbed_window`, called by hgn.training.torch_updates). Backend triton
+draws it in hgn.kernels.update (`Updates._assemble`, kernels `draw_waves` and `assemble_batch`). `quiet_weight` returns
+a sample's loss weight for both backends.
 Shape legend: W = m + 2 window frames (m velocities), N particles, F windows, S scenes, K waves.
 """
 
@@ -12,34 +12,12 @@ import torch
 
 from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
-from hgn.system.splitmix import splitmix64
 
 # Keys of the other random streams. Without a key these would repeat the numbers of the particles' noise.
-JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
+JITTER_STREAM, WAVE_STREAM = 0x5DEECE66D, 0x2545F4914F
 
 SMALLEST_ACCELERATION = 1e-30  # avoids a division by 0
 QUIET_WEIGHT = 4.0  # largest loss weight of a frame below training.quiet_acceleration
-
-
-def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tuple[float, float]:
-    """Returns the scale of a sample's noise in units of `noise_std`, and the loss weight of the sample.
-
-    `acceleration` is the root mean square of the target, domain units per frame squared, and r is its ratio to
-    `noise_std`. If r < 1, the scale is log-uniform between max(r, training.noise_min_scale) and 1. It is drawn from the
-    sample's seed, and the loss weight is 1 / scale^2. Otherwise both are 1. `quiet_weight` multiplies the loss weight.
-
-    A network does not learn to avoid errors that are small compared with the noise. At rest its bias stays at 1/20 of
-    the noise, and resting bodies creep over thousands of frames. So frames with small accelerations get noise of many
-    scales, like the noise levels of a denoiser (Song & Ermon 2019). All scales have equal weight in the loss.
-    """
-    quiet = quiet_weight(training, acceleration)
-    if training.noise_min_scale == 1.0 or training.noise_std == 0.0:
-        return 1.0, quiet
-    smallest = max(acceleration / training.noise_std, training.noise_min_scale)
-    if not smallest < 1.0:
-        return 1.0, quiet
-    scale = smallest ** (splitmix64(seed ^ SCALE_STREAM) / 2.0**64)
-    return scale, quiet / scale**2.0
 
 
 def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
@@ -92,23 +70,22 @@ def perturbed_window(
     The random walk is added to the velocities, and its sums to the positions. The next position is shifted like the
     last one, so the target becomes v_true^{n+1} - v_noisy^n. The network learns to undo the velocity error, as in GNS
     (Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have in common. In a
-    rollout the errors of a body's particles are correlated; independent noise averages out over a body. Each scene's
-    noise is multiplied by `batch.noise_scale_S`. Unused axes (`dimensions` and above) have no noise.
+    rollout the errors of a body's particles are correlated; independent noise averages out over a body. Unused axes
+    (`dimensions` and above) have no noise.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
         return window_WN3
     shift = []
     first = 0
-    scales = batch.noise_scale_S or (1.0,) * len(batch.seeds_S)
-    for count, seed, scale in zip(batch.particles_S, batch.seeds_S, scales, strict=True):
+    for count, seed in zip(batch.particles_S, batch.seeds_S, strict=True):
         generator = torch.Generator(window_WN3.device).manual_seed(seed)
         history = len(window_WN3) - 2
-        velocity_MN3 = random_walk((history, count, 3), scale * std_last * math.sqrt(1 - correlated), generator)
+        velocity_MN3 = random_walk((history, count, 3), std_last * math.sqrt(1 - correlated), generator)
         if correlated > 0:
             generator.manual_seed(seed ^ WAVE_STREAM)
             position_N3 = window_WN3[-2, first : first + count]
-            std = scale * std_last * math.sqrt(correlated)
+            std = std_last * math.sqrt(correlated)
             velocity_MN3 = velocity_MN3 + correlated_walk(position_N3, history, std, cell_size, generator=generator)
         first += count
         velocity_MN3[..., dimensions:] = 0.0

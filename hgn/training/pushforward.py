@@ -32,7 +32,7 @@ from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import corners_at_rest
 from hgn.schema import ConfigError, Vector
-from hgn.training.noise import noise_scale, target_acceleration
+from hgn.training.noise import quiet_weight, target_acceleration
 
 E = TypeVar("E")  # an episode as a backend reads it
 
@@ -181,8 +181,8 @@ class SimulatedScenes(Protocol[E, T]):
     def sample(self, episode: E, frame: int, window_WN3: torch.Tensor) -> T:
         """Returns the sample of a window around a frame."""
 
-    def drawn(self, sample: T, seed: int, weight: float, scale: float) -> T:
-        """Returns the sample with this seed, loss weight and noise scale."""
+    def drawn(self, sample: T, seed: int, weight: float) -> T:
+        """Returns the sample with this seed and loss weight."""
 
 
 class PushforwardPool(Generic[E, T]):
@@ -221,9 +221,8 @@ class PushforwardPool(Generic[E, T]):
         samples, scenes = list(samples), self._scenes
         for slot, (number, draw_weight) in enumerate(self._draws.drawn(update)):
             simulated, acceleration = self._samples[number]
-            seed = samples[slot].seed
-            scale, weight = noise_scale(self.training, acceleration, seed)
-            samples[slot] = scenes.drawn(simulated, seed, draw_weight * weight, scale)
+            weight = draw_weight * quiet_weight(self.training, acceleration)
+            samples[slot] = scenes.drawn(simulated, samples[slot].seed, weight)
         return samples
 
     def _by_frames(self, starts: Sequence[tuple[E, int]]) -> list[tuple[int, list[tuple[E, int]]]]:

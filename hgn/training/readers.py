@@ -17,7 +17,7 @@ from hgn.data.sampler import BLOCK_EPISODES, Sample, SamplerState
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.step_config import UNCONSTRAINED, StepConfig
-from hgn.training.noise import noise_scale
+from hgn.training.noise import quiet_weight
 from hgn.training.pushforward import Starts, simulated_barrier
 
 REMEMBERED_SCENES = 1024  # number of episodes whose rest shapes stay in memory
@@ -40,13 +40,12 @@ class ChunkReader(Protocol):
 
 
 class FrameDraws:
-    """Draws a sample's frame by importance, and its noise scale and loss weight by the frame's acceleration."""
+    """Draws a sample's frame by importance, and its loss weight by the frame's acceleration."""
 
     def __init__(self, store: AnyStore, training: TrainingConfig) -> None:
         self._store, self._training = store, training
         self._importance: dict[int, FrameImportance] = {}
-        low_noise = training.noise_min_scale < 1 or training.quiet_acceleration > 0
-        self.measures_frames = training.frame_importance > 0 or low_noise
+        self.measures_frames = training.frame_importance > 0 or training.quiet_acceleration > 0
 
     def measured(self, episode: Episode) -> FrameImportance | None:
         """Returns an episode's accelerations; None if no setting depends on them."""
@@ -58,7 +57,7 @@ class FrameDraws:
             self._importance[index] = importance
 
     def drawn(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
-        """Returns the samples with the drawn frames, loss weights and noise scales."""
+        """Returns the samples with the drawn frames and loss weights."""
         fraction = self._training.frame_importance
         if not self.measures_frames:
             return tuple(samples)
@@ -68,8 +67,8 @@ class FrameDraws:
                 self.add(sample.episode, self.measured(self._store.read(sample.episode)))
             importance = self._importance[sample.episode]
             frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
-            scale, scale_weight = noise_scale(self._training, importance.accelerations[frame], sample.seed)
-            drawn.append(sample._replace(frame=frame, weight=weight * scale_weight, noise_scale=scale))
+            weight *= quiet_weight(self._training, importance.accelerations[frame])
+            drawn.append(sample._replace(frame=frame, weight=weight))
         return tuple(drawn)
 
 
@@ -100,9 +99,7 @@ class WindowReader:
             if len(self._scenes) > REMEMBERED_SCENES:
                 self._scenes.popitem(last=False)
         scene = self._scenes[sample.episode]
-        return BatchSample(
-            scene, sample.frame, window_WN3, seed=sample.seed, weight=sample.weight, noise_scale=sample.noise_scale
-        )
+        return BatchSample(scene, sample.frame, window_WN3, seed=sample.seed, weight=sample.weight)
 
 
 class EpisodeReader:

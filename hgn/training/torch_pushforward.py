@@ -62,8 +62,8 @@ class TorchScenes:
     def sample(self, episode: Episode, frame: int, window_WN3: torch.Tensor) -> BatchSample:
         return BatchSample(episode, frame, window_WN3.numpy())
 
-    def drawn(self, sample: BatchSample, seed: int, weight: float, scale: float) -> BatchSample:
-        return replace(sample, seed=seed, weight=weight, noise_scale=scale)
+    def drawn(self, sample: BatchSample, seed: int, weight: float) -> BatchSample:
+        return replace(sample, seed=seed, weight=weight)
 
     def _barriers(self, episodes: Sequence[Episode]) -> Barriers | None:
         """Returns the obstacles that constrain simulations. Training windows have no barriers."""

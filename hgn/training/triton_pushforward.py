@@ -65,8 +65,8 @@ class TritonScenes:
         first = episode.first_frame + frame
         return DeviceSample(replace(episode, position_TN3=window_WN3, first_frame=first), 0, 0)
 
-    def drawn(self, sample: DeviceSample, seed: int, weight: float, scale: float) -> DeviceSample:
-        return sample._replace(seed=seed, weight=weight, noise_scale=scale)
+    def drawn(self, sample: DeviceSample, seed: int, weight: float) -> DeviceSample:
+        return sample._replace(seed=seed, weight=weight)
 
     def simulate(self, starts: Sequence[tuple[DeviceEpisode, int]], frames: int) -> list[torch.Tensor]:
         """Raises: ConfigError in the first call, if the kernels' results differ from PyTorch's on this machine."""

@@ -18,7 +18,7 @@ import tools.bench.command
 import tools.error_vs_time.command
 import tools.scaling.command
 from datagen import solve, upload
-from hgn import average, evaluate, export, play, rollout, train
+from hgn import evaluate, export, play, rollout, train
 from hgn.command import EXIT_INPUT
 from hgn.config import DatagenConfig
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
@@ -37,7 +37,6 @@ COMMANDS: dict[str, Callable[[dict[str, Any]], int]] = {
     "evaluate": evaluate.main,
     "render": render.main,
     "play": play.main,
-    "average": average.main,
     "bench": tools.bench.command.main,
     "curves": curves.main,
     "error_vs_time": tools.error_vs_time.command.main,

@@ -46,7 +46,6 @@ FOREIGN = [
     ("export", ["weights=obstacles_small", "onnx=mine.onnx"], "mine.onnx"),
     ("export", ["weights=obstacles_small", "package=mine.pt2"], "mine.pt2"),
     ("export", ["weights=obstacles_small", "arrays=made", "scene=scene.yaml"], "made/mine.npy"),
-    ("average", ["weights=[mechanics,mechanics]", "out=mine"], "mine"),
     ("play", ["rollout=rollout.vtkhdf", "html=mine.html"], "mine.html"),
     ("render", [*VTKHDF, "out=mine.webp"], "mine.webp"),
     ("render", [*VTKHDF, "out=mine.usdc"], "mine.usdc"),

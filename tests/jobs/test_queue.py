@@ -1,6 +1,5 @@
 """The queue of one machine: its GPUs share a list, barriers hold, it stops and goes on; and the lists of networks."""
 
-import json
 import os
 import signal
 import subprocess
@@ -13,7 +12,6 @@ import pytest
 from processes import PATIENCE_S, completed, processes_of_session, wait_until, write_program
 
 from datagen.generate import datagen_config
-from hgn.average import AverageConfig
 from hgn.config import DatagenConfig, TrainConfig
 from hgn.data.identity import dataset_identity
 from hgn.evaluate import EvaluateConfig
@@ -272,8 +270,7 @@ CONFIGS = {"datagen": datagen_config} | {
     module: partial(from_mapping, config)
     for module, config in (
         *(("hgn.train", TrainConfig), ("hgn.export", ExportConfig), ("hgn.evaluate", EvaluateConfig)),
-        *(("hgn.average", AverageConfig), ("tools.error_vs_time", ErrorVsTimeConfig)),
-        ("tools.stability", StabilityNetworkConfig),
+        *(("tools.error_vs_time", ErrorVsTimeConfig), ("tools.stability", StabilityNetworkConfig)),
     )
 }
 
@@ -370,33 +367,7 @@ def test_judged(listed):
     assert report.data == fresh.dataset.folder and weights in report.weights
 
 
-def test_pushforward(listed):
-    """jobs/pushforward.txt: it begins with weights that jobs/networks.txt exports; each training goes on from weights
-    that are there, on data that an earlier line makes; means are of weights that are there, and the last one is of the
-    network that results compare."""
-    data: dict[str, DatagenConfig] = {}
-    begun = "runs/obstacles/obstacles.safetensors"
-    assert listed("networks.txt")["obstacles"]["hgn.export"].out == begun
-    there, trained = {begun}, set[str]()
-    for name, configs in listed("pushforward.txt").items():
-        if "datagen" in configs:
-            data[configs["datagen"].dataset.folder] = configs["datagen"]
-        elif "hgn.average" in configs:
-            mean = configs["hgn.average"]
-            assert set(mean.weights) <= there and mean.stored_precision == "fp16"
-            there.add(mean.out)
-        else:
-            config, score = trained_and_scored(name, configs, data)
-            assert config.training.init_weights in there and score.data == "data/obstacles"
-            trained.add(config.dataset.folder)
-            there.add(score.weights)
-    assert trained == set(data) and name == "mean"
-    reported = json.loads((JOBS.parent / "results/error_vs_time/chosen.json").read_text())["rows"]
-    assert mean.out == configs["hgn.evaluate"].weights
-    assert Path(mean.out).name in {row.get("weights") for row in reported}
-
-
-@pytest.mark.parametrize(("file", "lines"), [("networks.txt", 10), ("mechanics.txt", 31), ("pushforward.txt", 8)])
+@pytest.mark.parametrize(("file", "lines"), [("networks.txt", 10), ("mechanics.txt", 31)])
 def test_trials(tmp_path, file, lines):
     """SCENES, SHARE and REPORTED shorten all data, trainings and reports, and change nothing else."""
     (tmp_path / "trial").mkdir()

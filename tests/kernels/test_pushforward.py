@@ -21,7 +21,7 @@ from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.schema import ConfigError
-from hgn.training.noise import noise_scale
+from hgn.training.noise import quiet_weight
 from hgn.training.pushforward import PushforwardPool, simulated_barrier
 from hgn.training.torch_pushforward import TorchScenes
 from hgn.training.triton_pushforward import TritonScenes
@@ -108,7 +108,7 @@ def test_the_pool_is_that_of_the_plain_path(changes, monkeypatch):
     scenes[2] = with_parameters(scenes[2])
     if "materials" in changes:
         scenes[::2] = [replace(made, material_N=np.full_like(made.material_N, ELASTIC)) for made in scenes[::2]]
-    drawn = {"noise_std": 0.5, "noise_min_scale": 0.1, "pushforward_importance": 0.5}
+    drawn = {"quiet_acceleration": 1.0, "pushforward_importance": 0.5}
     training = training_of(precision="fp32", pushforward_frames=2, **drawn)
     fast, plain = pools_of(network, training)
     if "obstacle_clearance" in changes:
@@ -139,10 +139,9 @@ def test_the_pool_is_that_of_the_plain_path(changes, monkeypatch):
     asked = {sample.episode: acceleration for sample, acceleration in fast._samples}
     mean = sum(asked.values()) / len(asked)
     for sample in mixed[:2]:
-        scale, weight = noise_scale(training, asked[sample.episode], sample.seed)
-        assert sample.noise_scale == scale and sample.frame == 0
+        weight = quiet_weight(training, asked[sample.episode])
+        assert weight > 1 and sample.frame == 0
         assert sample.weight == pytest.approx(weight / (0.5 + 0.5 * asked[sample.episode] / mean))
-    assert len({sample.noise_scale for sample in mixed[:2]} | {1.0}) == 3
 
 
 def test_long_episodes_are_simulated_for_longer():

@@ -188,8 +188,7 @@ def test_noise_and_jitter():
     wanted = (window[-1] - window[-2]) - first["velocity_NV"][:160, :3]
     expected = network.float().normaliser.normalise_acceleration(wanted)
     torch.testing.assert_close(first["target_N3"][:160], expected, rtol=0, atol=1e-3)
-    calm = assembled(updates, DeviceSample(made, 1, 5, 4.0, 0.25), DeviceSample(still, 0, 6))[:160] - velocity
-    torch.testing.assert_close(calm, walk / 4, rtol=0, atol=1e-7)
+    assembled(updates, DeviceSample(made, 1, 5, 4.0), DeviceSample(still, 0, 6))
     torch.testing.assert_close(updates.share_N[:280].cpu(), torch.tensor([4 / 320] * 160 + [1 / 240] * 120))
 
 
@@ -225,9 +224,6 @@ def test_correlated_noise():
     torch.testing.assert_close(walks[1.0], torch.cat(expected), rtol=0, atol=2e-6)
     assert 3e-4 < float(walks[1.0][:, 0].std()) < 3e-3
     torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
-    walk = assembled(updates, DeviceSample(*samples[0]), DeviceSample(*samples[1], noise_scale=0.5)) - velocity
-    torch.testing.assert_close(walk[:160], walks[1.0][:160], rtol=0, atol=0)
-    torch.testing.assert_close(walk[160:], walks[1.0][160:] / 2, rtol=0, atol=1e-6)
 
 
 def test_wrong_kernels_are_refused():

@@ -201,6 +201,16 @@ def test_what_is_no_such_file_is_refused(weights, change, message):
     assert before == (weights.read_bytes() if weights.exists() else None)
 
 
+def test_numbers_that_are_not_finite_are_not_written(weights):
+    """A number beyond the largest of the file's precision is named; the earlier file stays."""
+    (network, info), before = load_weights(weights), weights.read_bytes()
+    with torch.no_grad():
+        network.embedding.weight.fill_(-1e6)
+    with pytest.raises(ConfigError, match=r"weights tensor embedding\.weight must be finite in fp16, got -inf"):
+        save_weights(weights, network, info, stored_precision="fp16")
+    assert weights.read_bytes() == before
+
+
 def test_failed_save_leaves_the_old_file(weights, monkeypatch):
     """A full disk while writing leaves the earlier file, whole, and nothing beside it."""
     network, info = load_weights(weights)

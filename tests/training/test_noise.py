@@ -1,4 +1,4 @@
-"""Noise injection, how much noise a sample gets by how much happens in it, and grid jitter."""
+"""Noise injection, loss weights of quiet frames, and grid jitter."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,6 @@ from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import make_batch
 from hgn.training.noise import (
     jittered_origin,
-    noise_scale,
     perturbed_window,
     quiet_weight,
     random_walk,
@@ -76,16 +75,6 @@ def test_correlated_noise():
     assert torch.equal(perturbed_window(batch, STD, 0.0), perturbed_window(batch, STD))
 
 
-@pytest.mark.parametrize("smooth", [0.0, 0.3])
-def test_a_scene_can_have_less_noise(smooth):
-    """Each scene's noise is its scale times what its seed draws; without scales it is all of it."""
-    batch = batch_of(episode(50), episode(30, seed=1))
-    clean, whole = (perturbed_window(batch, std, smooth, 0.035).double() for std in (0.0, STD))
-    scaled = perturbed_window(replace(batch, noise_scale_S=(0.25, 1.0)), STD, smooth, 0.035).double()
-    torch.testing.assert_close(scaled[:, :50] - clean[:, :50], (whole - clean)[:, :50] / 4, rtol=0, atol=1e-7)
-    assert torch.equal(scaled[:, 50:], whole[:, 50:])
-
-
 def test_history_before_the_start_is_ballistic():
     """Before frame 0 the particles flew freely into their initial state: constant acceleration g dt^2."""
     stored = episode(30)
@@ -135,23 +124,6 @@ def test_jitter_fills_a_cell():
     torch.testing.assert_close(mean, torch.tensor(3.0))
 
 
-@pytest.mark.parametrize(("acceleration", "smallest"), [(0.0, 0.02), (1e-5, 0.02), (1e-4, 0.1), (5e-4, 0.5)])
-def test_scales_are_log_uniform_down_to_what_happens(acceleration, smallest):
-    """From the larger of the least scale and the frame's own acceleration up to 1, each seed its own; errors count in
-    units of the noise. It is as asked where more happens, where no other scale is asked for, and without noise."""
-    training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02)
-    drawn = [noise_scale(training, acceleration, seed) for seed in range(4000)]
-    assert drawn[7] == noise_scale(training, acceleration, 7)
-    scales = np.array([scale for scale, _ in drawn])
-    assert smallest <= scales.min() < smallest * 1.01 and 0.99 < scales.max() <= 1
-    share = np.sort(np.log(scales) / np.log(smallest))
-    assert np.abs(share - np.linspace(0, 1, len(share))).max() < 0.03
-    assert [weight for _, weight in drawn] == pytest.approx(1 / scales**2)
-    noiseless = TrainingConfig(noise_std=0.0, noise_min_scale=0.02)
-    for elsewhere, above in ((training, 1e-3), (training, 0.1), (training, float("nan")), (noiseless, 0.0)):
-        assert noise_scale(elsewhere, above, 5) == noise_scale(TrainingConfig(noise_std=1e-3), 0.0, 5) == (1.0, 1.0)
-
-
 def test_what_is_asked_for():
     """Root mean square over axes and particles of the last acceleration of each window."""
     time = torch.arange(7.0)
@@ -163,13 +135,9 @@ def test_what_is_asked_for():
 
 
 def test_what_rests_counts_more():
-    """Below `quiet_acceleration` a sample counts as often as its acceleration is smaller, up to `quiet_weight`, without
-    noise and beside the weight that noise gives it; by default all count alike."""
-    quiet = TrainingConfig(noise_std=0.0, quiet_acceleration=1e-3)
+    """Below `quiet_acceleration` a sample counts as often as its acceleration is smaller, up to `quiet_weight`; by
+    default all count alike."""
+    quiet = TrainingConfig(quiet_acceleration=1e-3)
     asked = (1.0, 1e-3, 5e-4, 1e-4, 1e-6, 0.0)
     assert [quiet_weight(quiet, acceleration) for acceleration in asked] == pytest.approx([1, 1, 2, 4, 4, 4])
-    assert noise_scale(quiet, 5e-4, 5) == (1.0, quiet_weight(quiet, 5e-4))
     assert quiet_weight(quiet, float("nan")) == quiet_weight(TrainingConfig(), 0.0) == 1.0
-    noisy = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02, quiet_acceleration=1e-3)
-    scale, weight = noise_scale(noisy, 4e-4, 5)
-    assert scale < 1 and weight == pytest.approx(2.5 / scale**2)

@@ -2,9 +2,9 @@
 
 The sample table has a row of int64 numbers for each scene of each update. A row holds: the address of the window's
 first frame of positions, number of particles, first row in the batch, seed, address of the materials (int32), weight of
-the loss, scale of the noise (each as the bits of a float64), address of the columns of parameters (float32; 0: all are
-0), address of RestShape.packed (0: no elastic bodies), and the scene's row of the obstacle table. The last column of
-that row is the symmetry of the sample.
+the loss (as the bits of a float64), address of the columns of parameters (float32; 0: all are 0), address of
+RestShape.packed (0: no elastic bodies), and the scene's row of the obstacle table. The last column of that row is the
+symmetry of the sample.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -17,7 +17,7 @@ from hgn.kernels.triton_compat import settle_keys
 from hgn.network import elastic
 from hgn.scene import rest_shape
 
-SAMPLE_COLUMNS = tl.constexpr(14)
+SAMPLE_COLUMNS = tl.constexpr(13)
 PACKED, NEIGHBOURS = tl.constexpr(elastic.PACKED), tl.constexpr(rest_shape.NEIGHBOURS)
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # offset of the jitter in the seed's stream, far from the noise
 WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # offset of the smooth noise in the seed's stream
@@ -43,7 +43,6 @@ def draw_waves(
     scene = tl.program_id(0)
     sample = samples + (tl.load(update).to(tl.int64) * scenes + scene) * SAMPLE_COLUMNS
     seed = tl.load(sample + 3)
-    amplitude_step *= tl.load(sample + 6).to(tl.float64, bitcast=True).to(tl.float32)
     index = tl.arange(0, WAVES)
     columns: tl.constexpr = 4 + 3 * HISTORY
     line = waves + (scene * WAVES + index) * columns
@@ -122,14 +121,14 @@ def assemble_batch(
     tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
     if PARAMETERS > 0:
         number = tl.arange(0, 8)[None, :]
-        values = tl.load(line + 7, mask=live, other=0)[:, None]
+        values = tl.load(line + 6, mask=live, other=0)[:, None]
         at = values.to(tl.pointer_type(tl.float32)) + own[:, None] * PARAMETERS + number
         written = live[:, None] & (number < PARAMETERS)
         value = tl.load(at, mask=written & (values != 0), other=0.0)
         tl.store(parameter_of + row[:, None] * WIDTH + number, value, mask=written)
     if REST:
         number = tl.arange(0, 64)[None, :]
-        shape = tl.load(line + 8, mask=live, other=0)[:, None]
+        shape = tl.load(line + 7, mask=live, other=0)[:, None]
         written = live[:, None] & (number < PACKED)
         at = shape.to(tl.pointer_type(tl.int32)) + own[:, None] * PACKED + number
         value = tl.load(at, mask=written & (shape != 0), other=0)
@@ -138,8 +137,6 @@ def assemble_batch(
         tl.store(rest_of + row[:, None] * PACKED + number, value, mask=written)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
-    if NOISE:
-        noise_row = noise_step * tl.load(line + 6, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
     if SYMMETRY:
@@ -164,7 +161,7 @@ def assemble_batch(
         v = walk
         for k in tl.static_range(HISTORY):
             if NOISE and axis < DIMENSIONS:
-                walk += noise_row * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
+                walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
             if WAVES > 0 and axis < DIMENSIONS:
                 walk += tl.sum(height * tl.load(wave + 4 + k * 3 + axis), 1)
             moved += walk

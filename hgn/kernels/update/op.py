@@ -75,10 +75,10 @@ class DeviceEpisode:
 
     @cached_property
     def row(self) -> np.ndarray:
-        """Returns the row of the sample table for frame 0, int64 [SAMPLE_COLUMNS], without seed, weight and noise."""
+        """Returns the row of the sample table for frame 0, int64 [SAMPLE_COLUMNS], without seed and weight."""
         obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
         parameters = 0 if self.parameter_NP is None else self.parameter_NP.data_ptr()
-        first = [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, parameters]
+        first = [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, parameters]
         first.append(0 if self.rest is None else self.rest.packed.data_ptr())
         return np.array([*first, *obstacles], np.int64)
 
@@ -90,7 +90,6 @@ class DeviceSample(NamedTuple):
     frame: int
     seed: int  # seed of noise, jitter and symmetry
     weight: float = 1.0  # weight of this sample in the loss
-    noise_scale: float = 1.0  # standard deviation of the noise in units of training.noise_std
 
 
 AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
@@ -207,8 +206,8 @@ class Updates:
         table[..., 0] += np.array([sample.frame for sample in flat]).reshape(count.shape) * count * 12
         table[..., 2] = count.cumsum(1) - count  # index of the first particle
         table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
-        real = np.array([(sample.weight, sample.noise_scale) for sample in flat], np.float64)
-        table[..., 5:7] = real.view(np.int64).reshape(*count.shape, 2)
+        weight = np.array([sample.weight for sample in flat], np.float64)
+        table[..., 5] = weight.view(np.int64).reshape(count.shape)
         shown = [Symmetry()] * len(flat)
         if self.symmetry:
             shown = [drawn_symmetry(sample.episode.symmetries, sample.seed) for sample in flat]
