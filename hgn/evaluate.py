@@ -71,7 +71,9 @@ def main(mapping: dict[str, Any]) -> int:
     if episodes[0].imported:
         paths = [trial.position_TN3 for trial in trials]
         own = set_convention(rows[0]["one_step_mse"], paths, episodes[: len(paths)] or episodes)
-        print(convention_lines(own))
+        print("in the set's own convention: mean over axes and frames; free particles, all particles")
+        for name, error in own.items():
+            print(f"{name.replace('_', ' '):<20} {error['free']:.3e}, {error['all']:.3e}")
     if config.json is not None:
         with errors_in_config(config.data):
             seed = store.manifest.config["seed"]
@@ -135,13 +137,6 @@ def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         initial = [InitialState.of_episode(episode) for episode in episodes]
         return simulate_scenes(simulator, initial, frames, lambda _: progress.update())
-
-
-def convention_lines(errors: dict[str, dict[str, float]]) -> str:
-    """Returns the errors of `set_convention` as text."""
-    lines = ["in the set's own convention: mean over axes and frames; free particles, all particles"]
-    lines += [f"{name.replace('_', ' '):<20} {error['free']:.3e}, {error['all']:.3e}" for name, error in errors.items()]
-    return "\n".join(lines)
 
 
 def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames: int) -> dict[str, Any]:

@@ -48,9 +48,8 @@ class ExportConfig:
         require(given, "checkpoint", "given, or weights instead", self.checkpoint)
         require(self.checkpoint is None or self.weights is None, "weights", "null with checkpoint", self.weights)
         require(self.checkpoint is None or self.out is not None, "out", "given with checkpoint", self.out)
-        named = self.out is None or self.out.endswith(".safetensors")
-        remedy = "onnx=, package= and arrays= write other formats"
-        require(named, "out", "a .safetensors name", self.out, remedy=remedy)
+        named, others = (self.out or ".safetensors").endswith(".safetensors"), "onnx=, package= write other formats"
+        require(named, "out", "a .safetensors name", self.out, others)
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
         for name, value in self.step_changes.items():
             require(self.out is not None, name, "null without out, the file that it changes", value)
@@ -117,7 +116,9 @@ def main(mapping: dict[str, Any]) -> int:
         write_onnx(Path(config.onnx), program, info)
         print(config.onnx)
     if config.arrays is not None:
-        write_arrays(Path(config.arrays), arrays)
+        Path(config.arrays).mkdir(parents=True, exist_ok=True)
+        for name, array in arrays.items():
+            np.save(f"{config.arrays}/{name}.npy", array)
         print(config.arrays)
     return 0
 
@@ -161,13 +162,6 @@ def change_step(network: ParticleNetwork, changes: dict[str, Any]) -> None:
     step = replace(network.step, **changes)
     step.require_fits(network.config.relative, network.config.dimensions)
     network.step = step
-
-
-def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes the first inputs of a step, one .npy file for each."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, array in arrays.items():
-        np.save(folder / f"{name}.npy", array)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,9 @@ from hgn.scene.distance import contains, extent
 from hgn.scene.group import Region, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS
 from hgn.scene.motion import AT_REST
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.scene import Scene
 from hgn.scene.scene_file import MILLIMETRES
-from hgn.schema import Vector, printable
+from hgn.schema import printable
 
 OVERLAP = 0.01  # smallest overlap that is noted, as a fraction of the smaller group's particles
 OVERLAP_SAMPLES = 1000  # number of particles of a group that are searched for overlaps
@@ -47,7 +47,9 @@ def notes_on_files(scene: Scene, duration_s: float = math.inf) -> list[str]:
         name = f"{name} ({extent(begin.vertex_V3)})"
         if ((low_B3 > scene.domain_size) | (high_B3 < 0)).any(axis=1).all():
             notes.append(f"outside the domain, out of reach of particles: {name}; see {key} and position")
-        elif (obstacle.motion is None or around) and not _reaches(begin, scene.domain_size, scene.cell_size):
+        elif (obstacle.motion is None or around) and not len(
+            barrier_pieces(begin.corners, scene.cell_size, scene.domain_size)
+        ):
             notes.append(f"no surface in the domain: {name}; see {key} and position{unit}")
         elif np.ptp(begin.vertex_V3, axis=0).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name}; see {key}")
@@ -86,8 +88,3 @@ def _overlaps(scene: Scene) -> Iterator[str]:
                 yield f"{name} overlaps {other_name}: {overlap:.0%} of the smaller one; the density is higher there"
                 break
         regions.append((name, region, position_N3))
-
-
-def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
-    """Returns whether a part of an obstacle's surface lies in the domain."""
-    return len(barrier_pieces(obstacle.corners, cell_size, domain_size)) > 0

@@ -181,18 +181,14 @@ class Precompilation:
         self._files.close()
 
 
-def compile_part(config: TrainConfig, several_ranks: bool, part: int, parts: int) -> int:
-    """Compiles every `parts`-th kernel, starting with number `part`. Returns the number of these kernels."""
-    launches = launches_of(config, several_ranks, sizes_of(config))
-    return len(compile_launches(list(launches.values())[part::parts]))
-
-
 def main() -> None:
-    """Compiles a part of the kernels of the training on standard input."""
+    """Compiles every `parts`-th kernel of the training on standard input, from number `part`. Prints their number."""
     os.nice(NICENESS)
     part, parts, capability, several_ranks = map(int, sys.argv[1:])
     use_target(capability)
-    print(compile_part(from_mapping(TrainConfig, json.load(sys.stdin)), bool(several_ranks), part, parts))
+    config = from_mapping(TrainConfig, json.load(sys.stdin))
+    launches = launches_of(config, bool(several_ranks), sizes_of(config))
+    print(len(compile_launches(list(launches.values())[part::parts])))
 
 
 if __name__ == "__main__":

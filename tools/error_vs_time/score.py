@@ -5,7 +5,7 @@ only scenes that reached the frame. Shape legend: T frames, N particles of a sce
 """
 
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -147,32 +147,23 @@ def _penetration(position_N3: np.ndarray, reference: Episode, frame: int) -> flo
     return fraction_inside(position_N3, obstacles_of_episode(reference), frame / reference.frame_rate_hz)
 
 
-def _of_materials(
-    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int]
-) -> Iterator[tuple[int, str, str, np.ndarray, np.ndarray]]:
-    """Yields scene, material, frame, and positions of particles, drawn at random, in rollout and reference.
-
-    Frames that a scene did not reach are left out.
-    """
+def _sinkhorn(
+    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], device: torch.device
+) -> list[OfMaterial]:
+    """Compares particles of each material, drawn at random. Frames that a scene did not reach are left out."""
+    parts, pairs = [], []
     for scene, (trial, reference) in enumerate(zip(trials, references, strict=True)):
         for index in np.unique(reference.material_N):
             chosen = np.flatnonzero(reference.material_N == index)
             chosen = np.random.default_rng(reference.seed).permutation(chosen)[:SINKHORN_POINTS]
             for frame in frames:
                 if frame < trial.frame_count:
-                    pair = trial.position_TN3[frame, chosen], reference.position_TN3[frame, chosen]
-                    yield scene, MATERIALS[index], str(frame), *pair
-
-
-def _sinkhorn(
-    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], device: torch.device
-) -> list[OfMaterial]:
-    parts = list(_of_materials(trials, references, frames))
-    pairs = [
-        (torch.from_numpy(one_N3).to(device), torch.from_numpy(other_N3).to(device)) for *_, one_N3, other_N3 in parts
-    ]
+                    both = (each.position_TN3[frame, chosen] for each in (trial, reference))
+                    one_N3, other_N3 = (torch.from_numpy(position_N3).to(device) for position_N3 in both)
+                    parts.append((scene, MATERIALS[index], str(frame)))
+                    pairs.append((one_N3, other_N3))
     values = sinkhorn_divergences(pairs, SINKHORN_BLUR)
-    return [(*part[:3], value) for part, value in zip(parts, values, strict=True)]
+    return [(*part, value) for part, value in zip(parts, values, strict=True)]
 
 
 def _means(values: Iterable[OfMaterial]) -> dict[str, dict[str, float]]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,8 @@ def gallery_rows(draw: str, chosen: Mapping[str, GalleryCase], mpm: MpmConfig, r
                 continue
             scenes[each.name] = entry
             yield from _rows(each, entry, [broken[name] for name in names])
-    for each, films, causes, frictionless in _simulated(again, mpm):
+    launches = groupby(sorted(again, key=_launch), _launch)
+    for each, films, causes, frictionless in chain.from_iterable(_launched(list(some), mpm) for _, some in launches):
         entry = {"simulated": {name: report.meta[name] for name in SIMULATED}, "kind": each.measure.kind}
         entry |= {"digest": each.digest, "series": {}, "particles": each.scenes[0].particle_count}
         scenes[each.name] = entry
@@ -136,23 +137,19 @@ def _name(case: GalleryCase, bound: BoundEntry) -> str:
     return f"{case.name}: {bound.label}"
 
 
-def _simulated(
-    cases: Sequence[GalleryCase], mpm: MpmConfig
-) -> Iterator[tuple[GalleryCase, dict[int, Film], list[str], Film | None]]:
-    """Yields films by grid, causes of failure, and the film without friction. Cases of a launch share their domain."""
-
-    def kind(case: GalleryCase) -> tuple[Any, ...]:
-        scene = case.scenes[0]
-        return scene.domain_size, scene.moves, scene.emits
-
-    for _, some in groupby(sorted(cases, key=kind), kind):
-        yield from _launched(list(some), mpm)
+def _launch(case: GalleryCase) -> tuple[Any, ...]:
+    """Returns the properties that cases of a launch share."""
+    scene = case.scenes[0]
+    return scene.domain_size, scene.moves, scene.emits
 
 
 def _launched(
     cases: Sequence[GalleryCase], mpm: MpmConfig
 ) -> Iterator[tuple[GalleryCase, dict[int, Film], list[str], Film | None]]:
-    """Simulates cases that share a domain: both grids, far bodies and scenes without friction."""
+    """Simulates cases of a launch: on both grids, also with far bodies and without friction.
+
+    Yields films by grid, causes of failure, and the film without friction.
+    """
     films: list[dict[int, Film]] = [{} for _ in cases]
     causes: list[list[str]] = [[] for _ in cases]
     without: list[Film | None] = [None for _ in cases]
