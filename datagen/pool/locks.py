@@ -32,16 +32,16 @@ class ShardLocks:
         with contextlib.ExitStack() as stack:
             opened = os.open(folder, os.O_RDONLY)
             stack.callback(os.close, opened)
-            shared = fcntl.LOCK_SH | fcntl.LOCK_NB  # a training may have the folder for itself
-            first = lock_if_supported(opened)
-            if not first and lock_if_supported(opened, shared) and not self._path.exists():
+            # a training may have locked the folder exclusively
+            shared = not lock_if_supported(opened) and lock_if_supported(opened, fcntl.LOCK_SH)
+            if shared and not self._path.exists():
                 raise ConfigError(
                     f"{self._path} must exist while generators run in its folder, got none: it was deleted; "
                     "wait for their end, or end them, and run the same command again"
                 )
             self._file = open_lock(self._path)
             stack.callback(os.close, self._file)
-            lock_if_supported(opened, shared)
+            lock_if_supported(opened, fcntl.LOCK_SH)
             self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE, wait=True)
             self._require_exclusion()
             self.close = stack.pop_all().close  # frees every lock

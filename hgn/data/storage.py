@@ -211,10 +211,11 @@ class _Folder(Storage):
         return path
 
 
+@functools.lru_cache(maxsize=16)
 def remote_storage(url: str) -> "RemoteStorage":
     """Returns the storage of a URL. Raises: ConfigError, as `open_storage`."""
     _require_address(url)
-    return _remote(url.rstrip("/"))
+    return RemoteStorage(url.rstrip("/"))
 
 
 class RemoteStorage(Storage):
@@ -370,9 +371,6 @@ class RemoteStorage(Storage):
             raise
         self._away = 0.0, ""
         return result
-
-
-_remote = functools.lru_cache(maxsize=16)(RemoteStorage)
 
 
 def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:

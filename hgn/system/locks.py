@@ -35,24 +35,19 @@ def open_lock(path: Path | str, flags: int = 0) -> int:
     return opened
 
 
-def lock_file(file: IO[Any] | int) -> bool:
+def lock_file(file: IO[Any] | int, kind: int = fcntl.LOCK_EX) -> bool:
     """Locks a file. Returns False if another process has the lock. Raises OSError with one of NO_LOCKS."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True
 
 
-def lock_if_supported(opened: int, kind: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> bool:
-    """Locks an open file or folder. Returns False if another process has the lock.
-
-    On a file system without locks, or without locks of folders, every process succeeds.
-    """
+def lock_if_supported(opened: int, kind: int = fcntl.LOCK_EX) -> bool:
+    """Locks a file or folder as `lock_file`. On file systems without locks of these every process succeeds."""
     try:
-        fcntl.flock(opened, kind)
-    except BlockingIOError:
-        return False
+        return lock_file(opened, kind)
     except OSError as error:
         if error.errno not in (*NO_LOCKS, errno.EBADF):  # EBADF is the error of folders on NFS
             raise

@@ -144,7 +144,7 @@ def test_proxies_are_honoured(monkeypatch, variable):
         monkeypatch.setenv("no_proxy", "excepted.example, 10.0.0.0/8 *.own.example,fd00::/8")
         for host in ("u:p@excepted.example:80", "10.200.3.4:80", "a.b.own.example", "[fd00:1::2]:80"):
             assert not hgn.data.storage._uses_proxies(f"http://{host}/set")
-        hgn.data.storage._remote.cache_clear()
+        hgn.data.storage.remote_storage.cache_clear()
         for url in ("http://data.example:9", address):
             assert open_storage(f"{url}/set").read("manifest.json", 0, 5) == b"hello"
     assert asked == ["http://data.example:9/set/manifest.json", "/set/manifest.json"]
@@ -177,7 +177,7 @@ def test_proxies_that_refuse_are_named(monkeypatch, scheme, status, message):
     for name in ("http_proxy", "https_proxy", "no_proxy"):
         monkeypatch.setenv(name, "")
     monkeypatch.setenv("HGN_PATIENCE_S", "0")
-    hgn.data.storage._remote.cache_clear()
+    hgn.data.storage.remote_storage.cache_clear()
     with answering(refusing(status)) as address:
         monkeypatch.setenv(f"{scheme}_proxy", address)
         with pytest.raises((ConfigError, OSError), match=message):

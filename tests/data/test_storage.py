@@ -287,11 +287,11 @@ def test_token(folder, serve, monkeypatch):
     for token in (None, "another-token-of-ours"):
         if token:
             monkeypatch.setenv(TOKEN_VARIABLE, token)
-        hgn.data.storage._remote.cache_clear()
+        hgn.data.storage.remote_storage.cache_clear()
         with pytest.raises(ConfigError, match="must be accessible, got access refused; set HGN_DATASET_TOKEN"):
             EpisodeStore(url, "train")
     monkeypatch.setenv(TOKEN_VARIABLE, TOKEN)
-    hgn.data.storage._remote.cache_clear()
+    hgn.data.storage.remote_storage.cache_clear()
     assert same_episodes(EpisodeStore(url, "train"), EpisodeStore(folder, "train"))
 
 
