@@ -270,8 +270,6 @@ def _require_memory(device: Device, scenes: Sequence[Scene], node_counts: tuple[
 
 
 def _require_sound(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) -> None:
-    if not np.isfinite(scene.velocity_N3).all():
-        raise ConfigError(f"velocity_N3 of scene {index} must be finite")
     position = np.asarray(scene.position_N3, np.float32)
     outside = np.flatnonzero(~((position >= low) & (position <= high)).all(axis=1))
     if len(outside):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hgn.schema import ConfigError
+from hgn.schema import require
 
 FRAGMENTS_AT_ONCE = 500_000
 # largest number of fragments of the obstacles in a picture, and per pixel in a large picture: at most 15 s
@@ -27,11 +27,9 @@ def fragments(corner_F32: np.ndarray, width: int, height: int) -> Iterator[tuple
     area_F1 = np.where(np.abs(area_F) > 1e-9, area_F, np.nan)[:, None]
     # weight of a corner = slope x + the weight in this row at x = 0
     slope_F3, rise_F3 = -edge_F32[:, :, 1] / area_F1, edge_F32[:, :, 0] / area_F1
-    low_F, high_F = (
-        np.clip(y_F, 0, height) for y_F in (corner_F32[:, :, 1].min(axis=1), corner_F32[:, :, 1].max(axis=1))
-    )
-    first_F, count = np.floor(low_F).astype(np.int64), 0
-    for triangle_R, row_R in _parts(np.where(np.isnan(area_F1[:, 0]), 0, np.ceil(high_F) - first_F)):
+    y_F3 = np.clip(corner_F32[:, :, 1], 0, height)
+    first_F, count = np.floor(y_F3.min(axis=1)).astype(np.int64), 0
+    for triangle_R, row_R in _parts(np.where(np.isnan(area_F1[:, 0]), 0, np.ceil(y_F3.max(axis=1)) - first_F)):
         row_R += first_F[triangle_R]
         slope_R3, place_R32 = slope_F3[triangle_R], after_F32[triangle_R]
         weight_R3 = rise_F3[triangle_R] * (row_R[:, None] + 0.5 - place_R32[:, :, 1]) - slope_R3 * place_R32[:, :, 0]
@@ -43,11 +41,8 @@ def fragments(corner_F32: np.ndarray, width: int, height: int) -> Iterator[tuple
         start_R, stop_R = np.clip((np.ceil(start_R - ROUNDING), np.floor(stop_R + ROUNDING) + 1), 0, width)
         covered_R = np.maximum(stop_R - start_R, 0)
         count += len(row_R) + int(covered_R.sum())
-        if count > (most := max(MOST_FRAGMENTS, MOST_PER_PIXEL * width * height)):
-            rule = f"cover at most {most:,} pixels in all"
-            raise ConfigError(
-                f"obstacles must have triangles that {rule}, got more; lower size, or take fewer triangles"
-            )
+        most, remedy = max(MOST_FRAGMENTS, MOST_PER_PIXEL * width * height), "lower size, or use fewer triangles"
+        require(count <= most, "obstacles", f"of triangles that cover at most {most:,} pixels in all", count, remedy)
         for row_S, x_S in _parts(covered_R):
             x_S += start_R[row_S].astype(np.int64)
             weight_S3 = weight_R3[row_S] + slope_R3[row_S] * (x_S[:, None] + 0.5)

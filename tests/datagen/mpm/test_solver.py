@@ -195,7 +195,6 @@ def spoiled(**values):
         (lambda: dataclasses.replace(GOOD, position_N3=GOOD.position_N3 - 1000), {}, "position_N3 of scene 1 .* walls"),
         (lambda: dataclasses.replace(GOOD, gravity=(0, np.nan, 0)), {}, "gravity must be three numbers"),
         (lambda: dataclasses.replace(GOOD, gravity=(0, np.inf, 0)), {}, "gravity must be three numbers"),
-        (lambda: spoiled(velocity_N3=np.nan), {}, "velocity_N3"),
         (lambda: dataclasses.replace(spoiled(velocity_N3=np.inf)), {}, "velocity_N3 must be finite.*particle 1"),
         (lambda: dataclasses.replace(spoiled(position_N3=np.inf)), {}, "position_N3 must be finite.*particle 1"),
         (lambda: GOOD, {"scenes": [dataclasses.replace(GOOD, cell_size=0.06)]}, "domain_size"),
