@@ -119,7 +119,7 @@ def material_rows(material_N: np.ndarray, materials: Sequence[str], names: Seque
     if (rows_N < 0).any():
         unknown = names[int(material_N[rows_N < 0][0])]
         raise ConfigError(
-            f"material must be one of the network's ({', '.join(materials)}), got {unknown}; "
+            f"material must be one of the training data's ({', '.join(materials)}), got {unknown}; "
             "use weights that were trained with it, for example own_physics"
         )
     return torch.from_numpy(rows_N)

@@ -40,12 +40,12 @@ class Motion:
         require(ordered, "keyframes", f"in order of time and {LEAST_S:g} s apart", times.tolist())
         require(times[0] >= 0, "keyframes", "at times >= 0", times.tolist())
         farthest = float(np.abs(self.translation_T3).max())
-        require(farthest <= FARTHEST, "keyframes", f"translations of at most {FARTHEST:g} units", farthest)
+        require(farthest <= FARTHEST, "keyframes.translation", f"at most {FARTHEST:g} domain units", farthest)
         rotation_T33 = np.asarray(self.rotation_T33, np.float64)
         near = bool(np.abs(rotation_T33).max() < 2)  # products of larger numbers may overflow
         away_T33 = rotation_T33 @ rotation_T33.transpose(0, 2, 1) - np.eye(3) if near else np.ones(1)
         upright = np.abs(away_T33).max() < UNIT and bool((np.linalg.det(rotation_T33) > 0).all())
-        require(upright, "keyframes", "rotations", float(rotation_T33.flat[0]))
+        require(upright, "keyframes.rotation", "rotation matrices", float(rotation_T33.flat[0]))
 
     @staticmethod
     def of_frames(keyframes: Keyframes, pivot: Vector) -> Motion:

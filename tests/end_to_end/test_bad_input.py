@@ -206,7 +206,10 @@ FILES = [
         )
     ),
     *((*call, RATE, RATES) for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
-    *((*call, SNOW, "one of the network's (snow), got ") for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
+    *(
+        (*call, SNOW, "one of the training data's (snow), got ")
+        for call in (("rollout", EPISODE), ("evaluate", EVALUATE))
+    ),
     ("evaluate", STEPS, of("weights", gravity=(0.0, -1.6, 0.0)), "gravity must be the weights' (0.0, -1.6, 0.0)"),
     ("evaluate", STEPS, of("weights", obstacle_cell_size=1 / 32), "cell_size must be the weights' 0.03125, the siz"),
 ]

@@ -139,7 +139,7 @@ def test_a_simulation_keeps_the_rest_shape():
     none = RestShape.joined([None, start.rest], [20, 50])[:20]
     assert simulator.start([random_scene(9)]).rest is None
     assert torch.equal(network(replace(plain, rest=none)), network(plain))
-    with pytest.raises(ConfigError, match="material must be one of the network's"):
+    with pytest.raises(ConfigError, match="material must be one of the training data's"):
         Simulator(network_of(inputs="local"), 60.0, "torch").start([both])
     with pytest.raises(ConfigError, match="materials must be a list with elastic if own_physics contains it"):
         NetworkConfig(inputs="local", own_physics=("elastic",))

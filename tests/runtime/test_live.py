@@ -192,7 +192,7 @@ def test_what_is_refused_changes_nothing():
     live, one_13, which_1 = LiveSimulation(simulator, first), np.full((1, 3), 0.5, np.float32), np.array([0])
     for call, message in (
         (lambda: live.add_particles(one_13, one_13, np.array([2])),
-         r"material must be one of the network's \(water, sand\), got snow"),
+         r"material must be one of the training data's \(water, sand\), got snow"),
         (lambda: live.add_particles(one_13, one_13[:, :2], which_1),
          r"velocity_A3 must be of shape \(1, 3\), got \(1, 2\)"),
         (lambda: live.add_particles([[0.5] * 3], one_13, which_1), "position_A3 must be a NumPy array, got 'list'"),

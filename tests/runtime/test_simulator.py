@@ -172,7 +172,7 @@ def scene_of(**change):
         (starting(position_N3=np.full((5, 3), 45.0)),
          r"position_N3 must be finite and no farther from the domain than its own size, got \[45.0, 45.0, 45.0\]"),
         (starting(network={"materials": ("snow", "water")}, material_N=np.array([0, 1, 2, 2, 2])),
-         r"material must be one of the network's \(snow, water\), got sand"),
+         r"material must be one of the training data's \(snow, water\), got sand"),
         (scene_of(position_N3=[[0.5, 0.5, 0.5]]), "position_N3 must be a NumPy array, got 'list'"),
         (scene_of(velocity_N3=np.zeros(3)), r"velocity_N3 must have shape \(1, 3\), got \(3,\)"),
         (scene_of(wall_friction=0.5), r"wall_friction must be three numbers from 0 to 1e\+09, got 0.5"),

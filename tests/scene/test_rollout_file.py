@@ -285,7 +285,10 @@ def external_points(file):
         *((attribute("frame_rate_hz", rate), "frame_rate_hz must be from 1e-9 to 1e9") for rate in (1e300, 5e-324)),
         (attribute("domain_size", np.full(3, 1e15)), r"domain_size\[0\] must be from 1e-9 to 1e9, got 1"),
         (attribute("gravity", np.full(3, 1j)), "must be a complete HDF5 file, got .*complex"),
-        *((turned(x * np.ones((1, 3, 3))), "must be rotations") for x in (0, np.nan, 1e300, -np.eye(3))),
+        *(
+            (turned(x * np.ones((1, 3, 3))), "rotation must be rotation matrices")
+            for x in (0, np.nan, 1e300, -np.eye(3))
+        ),
         *((turned(np.eye(3)[None], value), "pivot must be finite and at") for value in (np.nan, 1e300)),
         (external_points, "must be stored in the file itself"),
         (lambda file: file.__setitem__("VTKHDF/other", h5py.ExternalLink("/", "/")), "got a link in other"),

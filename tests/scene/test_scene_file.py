@@ -292,7 +292,7 @@ MISTAKES = [
     *(
         (
             obstacle_with(keyframes=[{"time": 0, "translation": [0, far, 0]}]),
-            "keyframes must be translations of at most 1000",
+            "keyframes.translation must be at most 1000 domain units",
         )
         for far in (1001.0, -1e12)
     ),

@@ -115,6 +115,8 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
 
     (tmp_path / "wet.yaml").write_text(f"groups: [{group.replace('sand, sand_friction_angle_deg: 60', 'water')}}}]\n")
     assert network.config.materials == ("water", "sand", "snow")
-    with pytest.raises(ConfigError, match=r"material must be one of the network's \(sand, snow\), got water; use"):
+    with pytest.raises(
+        ConfigError, match=r"material must be one of the training data's \(sand, snow\), got water; use"
+    ):
         rollout.main(out | {"scene": str(tmp_path / "wet.yaml")})
     assert "| materials | sand, snow |" in weights_card(info, "own", file.name, "mit")

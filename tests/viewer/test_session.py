@@ -363,7 +363,7 @@ def test_other_weights_go_on_from_here(session):
     state = session.live.state
     with pytest.raises(ConfigError, match=r"weights must be for 60.0 frames per second, got 30.0"):
         session.use_weights(Simulator(network_of(torch.float32), 30.0))
-    with pytest.raises(ConfigError, match=r"material must be one of the network's \(sand\), got water"):
+    with pytest.raises(ConfigError, match=r"material must be one of the training data's \(sand\), got water"):
         session.use_weights(Simulator(network_of(torch.float32, materials=("sand",)), 60.0))
     assert session.live.state.position_N3 is state.position_N3
     session.use_weights(simulator(2.0))
