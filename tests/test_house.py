@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_327,
-    "datagen": 8_929,
-    "tools": 6_302,
-    "tests": 35_579,
+    "hgn": 34_297,
+    "datagen": 8_927,
+    "tools": 6_290,
+    "tests": 35_586,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 
