@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 34_297,
-    "datagen": 8_927,
+    "datagen": 8_932,
     "tools": 6_290,
-    "tests": 35_586,
+    "tests": 35_596,
 }
 SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
 

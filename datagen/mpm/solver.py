@@ -9,6 +9,7 @@ import gc
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ SHARED_PARTICLES = 8  # fewest particles of such a block
 LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
 WARM_SCENES = 16  # largest number of scenes in a warm-up
 USUAL_PARTICLES = 4_000  # number of particles in a random scene
+ROUNDING = 2e-6  # largest distance of a particle from the bounds of coordinates, as a fraction of the upper one
 PARTICLE_BYTES, NODE_BYTES = 340, 50  # memory of a launch's arrays
 
 __all__ = [
@@ -96,7 +98,7 @@ def simulate(
     given, scenes = scenes, [at_entry(scene, frame_rate_hz) for scene in scenes]
     for index, (scene, entered) in enumerate(zip(given, scenes, strict=True)):
         require_free_entries(scene, entered)
-        _require_sound(entered, index, *particle_bounds(scene, config))
+        scenes[index] = _between_walls(entered, index, *particle_bounds(scene, config))
     if colliders is None:
         colliders = [build_collider(scene, config.choices.collider_band_cells) for scene in scenes]
     require(len(colliders) == len(scenes), "colliders", f"one for each of {len(scenes)} scenes", len(colliders))
@@ -269,12 +271,15 @@ def _require_memory(device: Device, scenes: Sequence[Scene], node_counts: tuple[
     )
 
 
-def _require_sound(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) -> None:
+def _between_walls(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) -> Scene:
+    """Returns the scene. Particles a rounding outside of the bounds, where networks stop them, are moved onto these."""
     position = np.asarray(scene.position_N3, np.float32)
-    outside = np.flatnonzero(~((position >= low) & (position <= high)).all(axis=1))
+    nearest = position.clip(low, high)
+    outside = np.flatnonzero(~(np.abs(position - nearest) <= ROUNDING * high).all(axis=1))
     if len(outside):
         raise ConfigError(
             f"position_N3 of scene {index} must lie within the walls, {low.tolist()} to {high.tolist()}, got "
             f"{position[outside[0]].tolist()} for particle {outside[0]} ({len(outside)} such particles); "
             "move the particles inwards or enlarge domain_size"
         )
+    return scene if (nearest == position).all() else replace(scene, position_N3=nearest)

@@ -152,6 +152,16 @@ def test_bounds_themselves_are_inside():
         assert_inside(simulated([scene], config, 5)[0].position_TN3, scene, config)
 
 
+def test_particles_start_where_networks_stop_them():
+    """1.5 or 2.5 cells from a plane, a rounding outside of the bounds, as in scenes that hgn.play saves."""
+    scene = particles([[1.5 * CELL] * 3, [1 - 2.5 * CELL] * 3], WATER, (2, 2, 2))
+    (outcome,) = simulated([scene], ADAPTIVE, 5)
+    assert np.abs(outcome.position_TN3[0] - scene.position_N3).max() < 2e-6
+    assert_inside(outcome.position_TN3, scene)
+    with pytest.raises(ConfigError, match="must lie within the walls"):
+        simulated([particles([[1.499 * CELL] * 3], WATER, (2, 2, 2))], ADAPTIVE, 5)
+
+
 def test_a_domain_that_is_no_cube():
     """Sides of 1, 0.75 and 1.375 with nodes that are no multiple of the block size: material spreads to each wall."""
     scene = block(WATER, (0.3, 0.2, 0.3), (0.6, 0.5, 0.6), (3, 0, 4), domain_size=(1.0, 0.75, 1.375))
