@@ -96,9 +96,9 @@ def simulate(
         return []
     node_counts = _largest_grid(scenes, config)
     given, scenes = scenes, [at_entry(scene, frame_rate_hz) for scene in scenes]
-    for index, (scene, entered) in enumerate(zip(given, scenes, strict=True)):
+    for scene, entered in zip(given, scenes, strict=True):
         require_free_entries(scene, entered)
-        scenes[index] = _between_walls(entered, index, *particle_bounds(scene, config))
+    scenes = [_between_walls(scene, index, *particle_bounds(scene, config)) for index, scene in enumerate(scenes)]
     if colliders is None:
         colliders = [build_collider(scene, config.choices.collider_band_cells) for scene in scenes]
     require(len(colliders) == len(scenes), "colliders", f"one for each of {len(scenes)} scenes", len(colliders))

@@ -114,7 +114,7 @@ def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float
 
 
 def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
-    free = [t.position_TND[:, ~np.isin(t.type_N, list(info.boundary_types))] for t in first]
+    free = [t.position_TND[:, ~info.obstacles(t.type_N)] for t in first]
     gravity = estimate_gravity(free, info.frame_dt_s)
     size = float(np.linalg.norm(gravity))
     if info.gravity_size is not None and abs(size - info.gravity_size) > 0.1 * info.gravity_size:
@@ -133,7 +133,7 @@ def _neighbour_count(first: list[Trajectory], info: SetInfo) -> float:
     counts: list[np.ndarray] = []
     usual: list[np.ndarray] = []  # radii with the usual number of neighbours
     for trajectory in first:
-        free_N = ~np.isin(trajectory.type_N, list(info.boundary_types))
+        free_N = ~info.obstacles(trajectory.type_N)
         for position_ND in trajectory.position_TND[[0, -1]][:, free_N]:
             tree, some_nD = KDTree(position_ND), position_ND[:: 1 + len(position_ND) // 1000]
             counts.append(tree.query_ball_point(some_nD, info.radius, return_length=True) - 1)
@@ -149,7 +149,7 @@ def _neighbour_count(first: list[Trajectory], info: SetInfo) -> float:
 
 
 def _boundary(trajectory: Trajectory, info: SetInfo) -> np.ndarray:
-    fixed_PD = trajectory.position_TND[0, np.isin(trajectory.type_N, list(info.boundary_types))]
+    fixed_PD = trajectory.position_TND[0, info.obstacles(trajectory.type_N)]
     own = trajectory.boundary_PD
     return fixed_PD if own is None else np.concatenate([fixed_PD, own])
 

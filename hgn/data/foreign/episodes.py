@@ -59,7 +59,7 @@ class Converter:
         info, name = self.info, trajectory.name
         frames, first = len(trajectory.position_TND), self.history
         require(frames >= first + 2, f"{name}: position", f"of at least {first} + 2 frames for history={first}", frames)
-        fixed_N = np.isin(trajectory.type_N, list(info.boundary_types))
+        fixed_N = info.obstacles(trajectory.type_N)
         require_inside(trajectory, info)
         require_fine(name, trajectory.position_TND, info.radius)
         position_TN3 = self._placed(trajectory.position_TND)

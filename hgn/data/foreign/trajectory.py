@@ -81,6 +81,10 @@ class SetInfo:
             there = len(self.gravity) == self.dimensions and bool(np.isfinite(self.gravity).all())
             require(there, "gravity", rule, list(self.gravity))
 
+    def obstacles(self, type_N: np.ndarray) -> np.ndarray:
+        """Returns which particles of these types are obstacles, bool [N]."""
+        return np.isin(type_N, list(self.boundary_types))
+
 
 def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions [T, N, D] and types int64 [N] of a file. `types` may be one number for all particles.
@@ -152,7 +156,7 @@ def _step(position_TND: np.ndarray, radius: float) -> float:
 
 def require_inside(trajectory: Trajectory, info: SetInfo) -> None:
     """Refuses trajectories without moving particles, and bounds that do not contain those of the first frame."""
-    free_N = ~np.isin(trajectory.type_N, list(info.boundary_types))
+    free_N = ~info.obstacles(trajectory.type_N)
     rule = "of particles that are not obstacles"
     require(bool(free_N.any()), f"{trajectory.name}: position", rule, "none", "leave it out")
     place_ND = trajectory.position_TND[0, free_N].astype(np.float64)
