@@ -383,7 +383,6 @@ class TrainingConfig:
     # simulated frames as a fraction of the episode's, if that is more than pushforward_frames; slow drifts show only in
     # long simulations
     pushforward_episode_fraction: BelowOne[float] = 0.0
-    pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the data that a target corrects
     # fraction of these samples drawn in proportion to their target acceleration, with loss weights that keep the
     # expected loss; 0: all are equally likely
     pushforward_importance: BelowOne[float] = 0.0

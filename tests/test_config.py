@@ -107,7 +107,6 @@ RULES = {
     train_on_six_frames: [
         ({"symmetry": "square"}, "symmetry must be one of none, gravity, got 'square'"),
         ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
-        ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
         ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
         ({"pushforward_fraction": 0.5, "frames": 2}, "dataset.frames must be at least 3 if .*_fraction > 0, got 2"),
     ],

@@ -16,12 +16,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_301,
+    "hgn": 34_438,
     "datagen": 8_932,
     "tools": 6_290,
-    "tests": 35_596,
+    "tests": 35_723,
 }
-SETTINGS = 236  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES: dict[str, int] = {}

@@ -41,6 +41,24 @@ def rest_neighbours(
     return position_N3, neighbour_NK
 
 
+def connected_bodies(neighbour_NK: np.ndarray) -> list[np.ndarray]:
+    """Returns the particles of each elastic body, int64: those that chains of rest neighbours connect."""
+    particle_E, place_E = np.nonzero(neighbour_NK >= 0)
+    part_N = _parts(np.stack([particle_E, neighbour_NK[particle_E, place_E]], 1), len(neighbour_NK))
+    row_B = np.unique(neighbour_NK[particle_E, place_E])
+    row_B = row_B[np.argsort(part_N[row_B], kind="stable")]
+    return np.split(row_B, np.flatnonzero(np.diff(part_N[row_B])) + 1) if len(row_B) else []
+
+
+def _parts(pair_P2: np.ndarray, count: int) -> np.ndarray:
+    """Returns the number of the connected part of each of `count` points, int [count]."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = coo_matrix((np.ones(len(pair_P2)), (pair_P2[:, 0], pair_P2[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(edges, directed=False)[1])
+
+
 def _nearest(point_B3: np.ndarray) -> np.ndarray:
     """Returns the numbers of each point's nearest others, int [B, at most K], by distance and then by number."""
     from scipy.spatial import cKDTree
@@ -60,12 +78,9 @@ def _connected(point_B3: np.ndarray) -> np.ndarray:
 
     The spacing is that of a cubic lattice with the same median distance of the neighbour number NEIGHBOURS.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     count, tree = len(point_B3), cKDTree(point_B3)
     distance_B, _ = tree.query(point_B3, k=[min(count, NEIGHBOURS + 1)])
     pair_P2 = tree.query_pairs(CONNECTED_SPACINGS * float(np.median(distance_B)) / math.sqrt(2), output_type="ndarray")
-    edges = coo_matrix((np.ones(len(pair_P2)), (pair_P2[:, 0], pair_P2[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(edges, directed=False)[1])
+    return _parts(pair_P2, count)

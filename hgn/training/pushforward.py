@@ -11,7 +11,7 @@ Noise shows the network random errors. The network's own errors are biased, and 
 Seed, update and rank determine all draws. The pool is not part of a checkpoint, so a resumed training simulates again.
 Its updates are those of an uninterrupted training if the checkpoint is at a multiple of `pushforward_every`.
 
-This module contains the rule and the pool; torch_pushforward and triton_pushforward simulate.
+This module contains the pool, pushforward_targets the targets; torch_pushforward and triton_pushforward simulate.
 Shape legend: H velocity history, F simulated frames, T = H + F + 2 frames of the data, W = H + 2 frames of a window,
 N particles, S scenes.
 """
@@ -33,6 +33,7 @@ from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import corners_at_rest
 from hgn.schema import ConfigError, Vector
 from hgn.training.noise import quiet_weight, target_acceleration
+from hgn.training.pushforward_targets import pushforward_windows
 
 E = TypeVar("E")  # an episode as a backend reads it
 
@@ -50,7 +51,6 @@ START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
 # Largest RMS distance of a frame from the data, in finest cells. Frames farther away are dropped, with all later ones:
 # the data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
 DROPPED_BEYOND = 0.5
-PULLED_WITHIN = 1.0  # targets clamp the position error to this on each axis, in finest cells
 
 
 class SimulationStoppedError(Exception):
@@ -105,26 +105,6 @@ class PoolDraws:
         return [self._by_size.at(place) for place in generator.random(count)]
 
 
-def pushforward_windows(
-    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float, cell_size: float
-) -> torch.Tensor:
-    """Returns the windows of one scene's simulation, [F, W, N, 3].
-
-    true_TN3 contains the frames of the data from H before the simulation's start to F + 1 after it, simulated_FN3 the F
-    frames after the start. A window ends with a simulated frame x_k and its target
-    x_k + (true_{k+1} - true_k) + pull (true_k - x_k). The second term corrects the velocity error. The third corrects
-    the fraction `pull` of the position error, which is clamped to PULLED_WITHIN on each axis. Walls are ignored.
-    """
-    frames = len(simulated_FN3)
-    history = len(true_TN3) - frames - 2
-    positions_TN3 = torch.cat([true_TN3[: history + 1], simulated_FN3])
-    inputs = positions_TN3.unfold(0, history + 1, 1)[1:].permute(0, 3, 1, 2)  # [F, H + 1, N, 3]
-    now_FN3, next_FN3 = true_TN3[history + 1 : -1], true_TN3[history + 2 :]
-    limit = PULLED_WITHIN * cell_size
-    target_FN3 = simulated_FN3 + (next_FN3 - now_FN3) + pull * (now_FN3 - simulated_FN3).clamp(-limit, limit)
-    return torch.cat([inputs, target_FN3[:, None]], dim=1)
-
-
 def usable_frames(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -177,6 +157,9 @@ class SimulatedScenes(Protocol[E, T]):
 
     def true_frames(self, episode: E, frame: int, simulated: int) -> torch.Tensor:
         """Returns the frames of the data from `frame` - H to `frame` + `simulated` + 1, [T, N, 3]."""
+
+    def materials_and_bodies(self, episode: E) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Returns each particle's material, and the particles of each elastic body, on the simulation's device."""
 
     def sample(self, episode: E, frame: int, window_WN3: torch.Tensor) -> T:
         """Returns the sample of a window around a frame."""
@@ -248,8 +231,14 @@ class PushforwardPool(Generic[E, T]):
         for ((episode, frame), path_FN3), truth, (count, square) in zip(
             pairs, truths, torch.stack(usable).tolist(), strict=True
         ):
-            windows = pushforward_windows(truth, path_FN3, self.training.pushforward_pull, cell_size)
-            windows = windows[: int(count)].contiguous()
+            if count == 0:
+                continue
+            length = len(truth) - len(path_FN3) + int(count)
+            material_N, bodies = scenes.materials_and_bodies(episode)
+            windows = pushforward_windows(
+                truth[:length], path_FN3[: int(count)], cell_size, material_N=material_N, bodies=bodies
+            )
+            windows = windows.contiguous()
             accelerations = target_acceleration(windows).tolist()
             self._samples += [
                 (scenes.sample(episode, frame + k + 1, window_WN3), acceleration)

@@ -15,6 +15,7 @@ from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.simulation import Simulation
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
+from hgn.scene.rest_shape import connected_bodies
 from hgn.training.errors import groups_of_frames
 from hgn.training.pushforward import SimulationStoppedError, simulated_barrier
 
@@ -58,6 +59,11 @@ class TorchScenes:
 
     def true_frames(self, episode: Episode, frame: int, simulated: int) -> torch.Tensor:
         return torch.from_numpy(window(episode, frame, self._network.config.velocity_history, simulated + 1))
+
+    def materials_and_bodies(self, episode: Episode) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        rest = episode.rest_neighbours if "elastic" in self._network.config.own_physics else None
+        bodies = [] if rest is None else connected_bodies(rest[1])
+        return torch.tensor(episode.material_N), [torch.from_numpy(body_B) for body_B in bodies]
 
     def sample(self, episode: Episode, frame: int, window_WN3: torch.Tensor) -> BatchSample:
         return BatchSample(episode, frame, window_WN3.numpy())

@@ -25,6 +25,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import joined_parameters
 from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
+from hgn.scene.rest_shape import connected_bodies
 
 SPARE = 1.1  # (capacity of a new stepper for particles) / (particles in its first simulation)
 
@@ -60,6 +61,11 @@ class TritonScenes:
 
     def true_frames(self, episode: DeviceEpisode, frame: int, simulated: int) -> torch.Tensor:
         return episode.position_TN3[frame : frame + self._history + simulated + 2].to(self.values.device)
+
+    def materials_and_bodies(self, episode: DeviceEpisode) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        device = self.values.device
+        bodies = [] if episode.rest is None else connected_bodies(episode.rest.neighbour_NK.cpu().numpy())
+        return episode.material_N.to(device), [torch.from_numpy(body_B).to(device) for body_B in bodies]
 
     def sample(self, episode: DeviceEpisode, frame: int, window_WN3: torch.Tensor) -> DeviceSample:
         first = episode.first_frame + frame

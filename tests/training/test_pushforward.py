@@ -18,7 +18,8 @@ from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.step_config import StepConfig
 from hgn.training import pushforward
-from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts, pushforward_windows
+from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts
+from hgn.training.pushforward_targets import pushforward_windows
 from hgn.training.torch_pushforward import TorchScenes
 
 HISTORY, CELL = 5, 0.1
@@ -26,30 +27,7 @@ HISTORY, CELL = 5, 0.1
 
 def training_of(**changes):
     values = {"batch_scenes": 4, "pushforward_fraction": 0.5, "pushforward_frames": 3}
-    return TrainingConfig(**values | {"pushforward_scenes": 2, "pushforward_pull": 0.25} | changes)
-
-
-def test_windows_are_those_of_the_simulation():
-    """Each simulated frame k gives the positions of the six frames up to it, the first of them true, and as the answer
-    its own place moved as the truth moves, plus a share of its distance from the truth: nothing with pull 0, all of
-    it with pull 1, where the answer is the truth; farther than a cell no particle is pulled harder."""
-    generator = torch.Generator().manual_seed(0)
-    true = torch.rand(HISTORY + 4 + 2, 7, 3, generator=generator, dtype=torch.float64)
-    simulated = true[HISTORY + 1 : -1] + 0.05 * torch.randn(4, 7, 3, generator=generator, dtype=torch.float64)
-    simulated[:, 0] += 3 * CELL
-    places = [*true[: HISTORY + 1], *simulated]
-    for pull in (0.0, 0.25, 1.0):
-        windows = pushforward_windows(true, simulated, pull, CELL)
-        assert windows.shape == (4, HISTORY + 2, 7, 3)
-        for k, found in enumerate(windows):
-            for i in range(HISTORY + 1):
-                assert torch.equal(found[i], places[k + 1 + i])
-            now = HISTORY + 1 + k
-            distance = (true[now] - simulated[k]).clamp(-CELL, CELL)
-            torch.testing.assert_close(found[-1], simulated[k] + true[now + 1] - true[now] + pull * distance)
-            near = (true[now] - simulated[k]).abs() < CELL
-            if pull == 1.0:
-                torch.testing.assert_close(found[-1][near], true[now + 1][near])
+    return TrainingConfig(**values | {"pushforward_scenes": 2} | changes)
 
 
 def test_what_is_simulated_is_drawn_from_seed_and_update():
@@ -165,7 +143,8 @@ def test_the_pool_is_what_the_network_does(network):
             state = Simulator(network, 60.0).step(state)
             path.append(state.position_N3)
         true = torch.from_numpy(window(made, frame, HISTORY, 4))
-        expected += list(pushforward_windows(true, torch.stack(path), 0.25, network.config.cell_size))
+        materials = torch.tensor(made.material_N)
+        expected += list(pushforward_windows(true, torch.stack(path), network.config.cell_size, materials))
     for (sample, _), wanted, origin in zip(own._samples, expected, [0, 0, 0, 1, 1, 1], strict=True):
         assert sample.episode is episodes[origin]
         np.testing.assert_allclose(sample.window_WN3, wanted.numpy(), rtol=0, atol=1e-7)
