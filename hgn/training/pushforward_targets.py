@@ -47,7 +47,7 @@ def pushforward_windows(
     true_FN3, velocity_FN3 = true_TN3[history + 1 : -1].double(), true_TN3[history + 1 :].double().diff(dim=0)
     error_FN3 = true_FN3 - simulated_FN3
     near_FN3 = error_FN3.clamp(-LIMIT * cell_size, LIMIT * cell_size)
-    step_FN3 = moved_velocities(true_FN3, velocity_FN3, -near_FN3, material_N, cell_size)
+    step_FN3 = moved_velocities(true_FN3, velocity_FN3, -near_FN3, material_N, cell_size=cell_size)
     pull_FN3 = PULL * near_FN3
     for body_B in bodies:
         rigid_FB3 = rigidly_moved(true_FN3[:, body_B], simulated_FN3[:, body_B].double())
