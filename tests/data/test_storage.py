@@ -259,9 +259,10 @@ def test_clock_that_was_set_back(folder, cache, monkeypatch):
 
 
 @pytest.mark.parametrize("patience_s", [0.0, 0.2, 1e6])
-def test_who_fetches_was_stopped(folder, cache, patience_s):
+def test_who_fetches_was_stopped(folder, cache, monkeypatch, patience_s):
     """A process that was stopped while it fetched a shard is not waited for without end, and not at all by a training
     that ends."""
+    monkeypatch.setattr(shard_cache, "_STALLED_S", 0.1)
     url = in_memory(folder, "stopped")
     entry = Manifest.load(url).shards[0]
     with partial_of(entry, cache).open("wb") as partial, contextlib.ExitStack() as stack:
