@@ -36,7 +36,7 @@ from hgn.schema import (
 )
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims
-from hgn.system.files import make_folder, write_atomically
+from hgn.system.files import errors_name, make_folder, write_atomically
 from hgn.system.hub import hub_weights
 
 FORMAT_VERSION = 1
@@ -133,8 +133,9 @@ def load_weights(
         remedy = f"write one with python -m hgn.export checkpoint={path / 'checkpoints' / 'best.ckpt'}"
         remedy = remedy if path.is_dir() else near_file(path) or "write one with python -m hgn.export"
         raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
-    try:
+    with errors_name(path):
         data = path.read_bytes()  # not mapped: a file that another program cut would end the process
+    try:
         tensors = load(data)
         metadata = strict_json(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, OverflowError) as error:

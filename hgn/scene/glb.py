@@ -32,12 +32,13 @@ _INDICES = (5121, 5123, 5125)
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
-def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_glb(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices, float64 [V, 3], and triangles, int64 [F, 3], of the file's scene.
 
+    `data` is the content of `path`.
     Raises: ValueError, LookupError, TypeError, struct.error or OSError for damaged, missing or unsupported data.
     """
-    tree, binary = _chunks(path.read_bytes())
+    tree, binary = _chunks(data)
     unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]
     if unknown:
         raise ValueError(f"it requires {', '.join(unknown)}, which is not read; export it without")

@@ -6,7 +6,6 @@ Writes files on disks that fail: HDF5 loses refused data without an error or end
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from hgn.schema import ConfigError
 from hgn.system.claims import Claims
+from hgn.system.files import LibraryFile, opened
 
 if TYPE_CHECKING:
     import h5py
@@ -39,7 +39,7 @@ def damage_named(rule: str, remedy: str) -> Iterator[None]:
         raise ConfigError(f"{rule}, got {' '.join(str(error).split())}; {remedy}") from error
 
 
-class FileOnDisk(io.FileIO):
+class FileOnDisk(LibraryFile):
     """A new file for h5py that keeps what the disk refuses, until `settle` has written it."""
 
     def __init__(self, path: Path) -> None:
@@ -48,16 +48,17 @@ class FileOnDisk(io.FileIO):
 
     def write(self, data: Any) -> int:
         content = bytes(data)
-        self._attempt(self.tell(), content)
-        self.seek(len(content), os.SEEK_CUR)
+        self._attempt(self.place, content)
+        self.place += len(content)
+        self.size = max(self.size, self.place)
         return len(content)
 
     def truncate(self, size: int | None = None) -> int:
-        end = self.tell() if size is None else size
-        self._attempt(end, None)
-        return end
+        self.size = self.place if size is None else size
+        self._attempt(self.size, None)
+        return self.size
 
-    def readinto(self, buffer: Any) -> Any:
+    def readinto(self, buffer: Any) -> int:
         self.settle()
         return super().readinto(buffer)
 
@@ -78,20 +79,20 @@ class FileOnDisk(io.FileIO):
             del self._waiting[0]
 
 
-def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
+@contextlib.contextmanager
+def open_hdf5(path: Path, rule: str, remedy: str) -> Iterator[h5py.File]:
     """Opens a file that contains all its data, each object once, and is large enough for them.
 
-    Raises: ConfigError, as `damage_named` does.
+    Raises: ConfigError, as `damage_named` does, also for the caller's reading; OSError of the disk.
     """
     import h5py
 
-    with damage_named(rule, remedy), contextlib.ExitStack() as stack:
-        if not path.is_file():  # opening a pipe would wait for ever
-            raise OSError("no plain file")
-        file = stack.enter_context(h5py.File(path, "r"))
-        _require_own_data(file, path, Claims(path), {h5py.h5o.get_info(file.id).addr})
-        stack.pop_all()
-    return file
+    if not path.is_file():  # opening a pipe would wait for ever
+        raise ConfigError(f"{rule}, got no plain file; {remedy}")
+    claims = Claims(path)
+    with opened(path) as content, damage_named(rule, remedy), h5py.File(content, "r") as file:
+        _require_own_data(file, path, claims, {h5py.h5o.get_info(file.id).addr})
+        yield file
 
 
 def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: set[int], depth: int = 0) -> None:

@@ -30,6 +30,7 @@ from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, near_file, require
+from hgn.system.files import errors_name
 
 _FACET = re.compile(
     rb"\bfacet(?:\s+normal)?(?:\s+\S+){3}\s+outer\s+loop((?:\s+vertex(?:\s+\S+){3}){3})\s+endloop\s+endfacet\b", re.I
@@ -116,8 +117,10 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     if not path.is_file():
         remedy = near_file(path) or f"there is no file at {path.absolute()}"
         raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
+    with errors_name(path):
+        data = b"" if path.suffix.lower() in USD_ENDINGS else path.read_bytes()
     try:
-        vertex, triangle = read_glb(path) if path.suffix.lower() == ".glb" else _read_polygons(path)
+        vertex, triangle = (read_glb if path.suffix.lower() == ".glb" else _read_polygons)(path, data)
     except (ConfigError, ModuleNotFoundError):
         raise
     except Exception as error:  # damaged files raise any kind of error
@@ -134,10 +137,9 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     return vertex, triangle
 
 
-def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_polygons(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Reads STL, OBJ, PLY and USD."""
     kind = path.suffix[1:].lower()
-    data = b"" if f".{kind}" in USD_ENDINGS else path.read_bytes()
     if kind == "stl":
         vertex_V3 = _corners_of_stl(data).reshape(-1, 3).astype(np.float64)
         return vertex_V3, np.arange(len(vertex_V3)).reshape(-1, 3)

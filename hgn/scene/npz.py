@@ -4,6 +4,7 @@ geoelements/gns stores trajectories as object arrays, which NumPy pickles. NumPy
 file. An invalid array state would make it write outside its memory.
 """
 
+import contextlib
 import io
 import math
 import pickle
@@ -19,6 +20,7 @@ import numpy as np
 
 from hgn.schema import ConfigError
 from hgn.system.claims import Claims, require_plain_pickle
+from hgn.system.files import opened
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
@@ -80,10 +82,15 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
     """Yields names and read-only arrays of an archive. Arrays of one folder follow one another.
 
     With `objects` arrays may contain arrays, numbers, tuples, lists and dicts. Raises: ConfigError naming the file and
-    the array that is incomplete, altered, or contains other objects.
+    the array that is incomplete, altered, or contains other objects; OSError of the disk.
     """
+    with opened(path) if isinstance(path, Path) else contextlib.nullcontext(path) as file:
+        yield from _read_archive(file, path, objects)
+
+
+def _read_archive(file: BinaryIO, path: Path | BinaryIO, objects: bool) -> Iterator[tuple[str, np.ndarray]]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             claims, folders = Claims(str(path), _size(archive)), dict[str, int]()
             for info in archive.infolist():
                 if archive.getinfo(info.filename) is not info:

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from hgn.scene.hdf5 import FileOnDisk, damage_named, open_hdf5
+from hgn.scene.hdf5 import FileOnDisk, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
@@ -218,10 +218,11 @@ def read_rollout(path: str | Path) -> Rollout:
     if not path.is_file():
         raise ConfigError(f"rollout must be an existing file, got {path}; python -m hgn.rollout writes one")
     rule, remedy = f"{path}: rollout must be a complete HDF5 file", "write it again"
-    with damage_named(rule, remedy), open_hdf5(path, rule, remedy) as file:
+    claims = Claims(path)
+    with open_hdf5(path, rule, remedy) as file:
         _check_format(file, path)
         try:
-            return _read(file, Claims(path))
+            return _read(file, claims)
         except ConfigError as error:
             raise ConfigError(f"{path}: rollout must be consistent, got {error}; {remedy}") from error
 

@@ -70,6 +70,58 @@ def read_replaced(path: Path) -> bytes:
     raise AssertionError
 
 
+class LibraryFile(io.RawIOBase):
+    """A file for a library. It stores the last error of reading, and its own size and position."""
+
+    def __init__(self, path: Path, mode: str = "rb") -> None:
+        self._file = io.FileIO(path, mode)
+        self.place, self.size = 0, os.fstat(self._file.fileno()).st_size
+        self.fault: OSError | None = None
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        place = (0, self.place, self.size)[whence] + offset
+        if place < 0:  # zipfile looks for records there
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        self.place = place
+        return place
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            count = os.preadv(self.fileno(), [buffer], self.place)
+        except OSError as error:
+            self.fault = error
+            raise
+        self.place += count
+        return count
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Yields a file for a library to read. Raises: OSError of the disk, which names `path`.
+
+    Libraries take such an error for damage of the file, or for its end.
+    """
+    with errors_name(path), LibraryFile(path) as file:
+        try:
+            yield io.BufferedReader(file)
+        finally:
+            if file.fault is not None:
+                raise file.fault
+
+
 def open_at_once(path: Path) -> io.BufferedReader:
     """Opens a file for reading. A pipe or a device counts as empty, because reading it might not end."""
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115 - returned

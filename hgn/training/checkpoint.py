@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch.nn import functional
@@ -35,6 +35,7 @@ from hgn.schema import (
 )
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims, require_few_items, require_plain_pickle
+from hgn.system.files import opened
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
@@ -98,38 +99,19 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """Returns the content of a checkpoint. Only plain containers and tensors are loaded.
 
     CRCs are compared, because torch does not detect changed bits. Raises: ConfigError if there is no file, or if its
-    content is not that of a checkpoint of this project; DamagedError if it cannot be read as one whole, plain archive.
+    content is not that of a checkpoint of this project; DamagedError if it cannot be read as one whole, plain archive;
+    OSError of the disk.
     """
-    try:
-        if not path.is_file():  # reading a pipe would wait for ever
-            raise FileNotFoundError
-        with zipfile.ZipFile(path) as records:
-            claims, names = Claims(path), set[str]()
-            _require_one_reading(path, records.start_dir)
-            for record in records.infolist():
-                claims.add(record.filename, record.file_size)
-                if (name := record.filename.lower()) in names:  # torch ignores the case of names
-                    raise ValueError(f"it has {record.filename} twice")
-                names.add(name)
-                if record.compress_type != zipfile.ZIP_STORED:
-                    raise ValueError(f"{record.filename} is compressed")
-                if name.endswith("/data.pkl"):
-                    require_plain_pickle(records.read(record), _CALLED)
-            if (damaged := records.testzip()) is not None:
-                raise zlib.error(f"{damaged} has a wrong CRC")
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        require_few_items(checkpoint)
-    except FileNotFoundError:
+    if not path.is_file():  # reading a pipe would wait for ever
         last, remedy = path.parent / LAST_NAMES[0], near_file(path) or "hgn.train writes one"
         of_run = [file for name in (BEST_NAME, *LAST_NAMES) if (file := path / "checkpoints" / name).is_file()]
         if path.name == BEST_NAME and last.is_file():
             remedy = f"no validation scene was measured, so use {last}"
         elif of_run:
             remedy = f"use {of_run[0]}"
-        raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
-    except Exception as error:  # torch raises any kind of error for damaged files
-        reason = str(error).strip().split("\n")[0]
-        raise DamagedError(f"checkpoint must be a complete checkpoint file, got {path}: {reason}") from error
+        raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}")
+    with opened(path) as content:
+        checkpoint = _read(path, content)
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     plain = isinstance(state, dict) and all(
         isinstance(name, str) and isinstance(tensor, torch.Tensor) for name, tensor in state.items()
@@ -143,14 +125,39 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def _require_one_reading(path: Path, directory: int) -> None:
+def _read(path: Path, file: BinaryIO) -> Any:
+    claims, names = Claims(path), set[str]()
+    try:
+        with zipfile.ZipFile(file) as records:
+            _require_one_reading(file, records.start_dir)
+            for record in records.infolist():
+                claims.add(record.filename, record.file_size)
+                if (name := record.filename.lower()) in names:  # torch ignores the case of names
+                    raise ValueError(f"it has {record.filename} twice")
+                names.add(name)
+                if record.compress_type != zipfile.ZIP_STORED:
+                    raise ValueError(f"{record.filename} is compressed")
+                if name.endswith("/data.pkl"):
+                    require_plain_pickle(records.read(record), _CALLED)
+            if (damaged := records.testzip()) is not None:
+                raise zlib.error(f"{damaged} has a wrong CRC")
+        file.seek(0)
+        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+        require_few_items(checkpoint)
+    except Exception as error:  # torch raises any kind of error for damaged files
+        reason = str(error).strip().split("\n")[0]
+        raise DamagedError(f"checkpoint must be a complete checkpoint file, got {path}: {reason}") from error
+    return checkpoint
+
+
+def _require_one_reading(file: BinaryIO, directory: int) -> None:
     """Raises ValueError if torch could read another directory of the archive than zipfile did.
 
     It could if bytes precede the archive, or if the file has a second end record.
     """
-    with path.open("rb") as file:
-        # the zip64 end record (56 bytes), its locator (20) and the end record (22)
-        begin, tail_at, tail = file.read(4), file.seek(-98, os.SEEK_END), file.read()
+    file.seek(0)
+    # the zip64 end record (56 bytes), its locator (20) and the end record (22)
+    begin, tail_at, tail = file.read(4), file.seek(-98, os.SEEK_END), file.read()
     wide = tail[56:60] == b"PK\6\7"
     named = int.from_bytes(tail[48:56] if wide else tail[92:96], "little")
     fits = begin == b"PK\3\4" and tail[76:80] == b"PK\5\6" and named == directory

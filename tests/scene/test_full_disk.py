@@ -1,21 +1,44 @@
 """Rollouts on a disk that refuses data for a while or for good; a limit on the size of files stands in for it."""
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
 from scene.test_rollout_file import contents, growing
 
 from hgn.scene import rollout_file
+from hgn.scene.hdf5 import FileOnDisk
 from hgn.scene.rollout_file import write_frames, write_rollout
 
 
-@pytest.mark.parametrize("size", [0, 5000, 40_000])
+@pytest.fixture
+def no_file(monkeypatch):
+    """Replaces the file that is written by a pipe, which refuses to seek too; None: undoes it."""
+    disks, ends = [], os.pipe()
+    monkeypatch.setattr(rollout_file, "FileOnDisk", lambda path: disks.append(FileOnDisk(path)) or disks[-1])
+
+    def replace(size):
+        if size is not None:
+            disks.append(os.dup(disks[-1].fileno()))
+            os.dup2(ends[1], disks[-2].fileno())
+        else:
+            os.dup2(disks[-1], disks[-2].fileno())
+
+    yield replace
+    for number in (*ends, disks[-1]):
+        os.close(number)
+
+
+@pytest.mark.parametrize(
+    ("how", "size"), [("file_limit", 0), ("file_limit", 5000), ("file_limit", 40_000), ("no_file", 0)]
+)
 @pytest.mark.parametrize("refused", [1, 2, 5])
 @pytest.mark.parametrize("lasting", [False, True])
-def test_refused_data(tmp_path, monkeypatch, file_limit, refused, size, lasting):
+def test_refused_data(tmp_path, monkeypatch, request, refused, how, size, lasting):
     """Data that the disk refuses for a while are written later, and else the file of before stays. HDF5 lost such data
     without an error, or ended the process."""
+    file_limit = request.getfixturevalue(how)
     monkeypatch.setattr(rollout_file, "WRITE_EVERY_S", -1.0)
     whole, path, take_frames = growing(), tmp_path / "a.vtkhdf", rollout_file.take_frames
     write_rollout(path, dataclasses.replace(whole, position_TN3=whole.position_TN3[: refused + 1]))
@@ -30,7 +53,7 @@ def test_refused_data(tmp_path, monkeypatch, file_limit, refused, size, lasting)
                 file_limit(size)
             yield position_N3[: whole.present(frame)]
 
-    with pytest.raises(OSError, match="File too large"):
+    with pytest.raises(OSError, match=r"File too large|Illegal seek"):
         write_frames(path, dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan)), frames())
     np.testing.assert_equal(contents(path), expected)
     assert [each.name for each in tmp_path.iterdir()] == ["a.vtkhdf"]

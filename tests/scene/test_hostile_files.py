@@ -1,6 +1,7 @@
 """Files from anywhere: what is wrong with them ends in one line, never in a traceback, a hang or foreign data."""
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -324,6 +325,36 @@ FILES = {
     "yaml": ("s.yaml", b"groups:\n- {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: sand}\n", load_scene),
     "json": ("i.jsonl", b'{"bytes": 12, "totals": {"train": 7}}', lambda path: parse_json(path.read_bytes(), "i")),
 }
+
+
+@pytest.mark.parametrize("read", [0, 1])
+@pytest.mark.parametrize("kind", ["hdf5", "npz", "checkpoint", "lagrangebench", "neuralmpm"])
+def test_a_disk_that_fails_while_a_library_reads(tmp_path, monkeypatch, kind, read):
+    """The error is the system's, with the file's name. Libraries took it for damage, or for another kind of file."""
+    name, content, decode = FILES[kind]
+    path, preadv, places = tmp_path / name, os.preadv, []
+    path.write_bytes(content)
+
+    def failing(*arguments):
+        places.append(arguments)
+        if len(places) > read:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return preadv(*arguments)
+
+    monkeypatch.setattr(os, "preadv", failing)
+    with pytest.raises(OSError, match=rf"Input/output error: .*{name}"):
+        decode(path)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "glb", "obj", "weights", "tfrecord"])
+def test_a_disk_that_fails(tmp_path, kind):
+    """The error is the system's, with the file's name, and not damage of the file. Memory without pages stands in."""
+    name, _, decode = FILES[kind]
+    path = tmp_path / name
+    path.symlink_to("/proc/self/mem")
+    decode = decode if kind != "tfrecord" else lambda path: list(read_records(path))
+    with pytest.raises(OSError, match=rf"Input/output error: .*{name}"):
+        decode(path)
 
 
 @pytest.mark.parametrize("kind", FILES)

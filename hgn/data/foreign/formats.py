@@ -14,6 +14,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -328,7 +329,7 @@ _AGAIN = "fetch it again"
 _EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015"}
 
 
-def _opened(path: Path) -> h5py.File:
+def _opened(path: Path) -> AbstractContextManager[h5py.File]:
     return open_hdf5(path, f"{path} must be a complete HDF5 file", _AGAIN)
 
 

@@ -14,13 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hgn.schema import ConfigError
+from hgn.system.files import errors_name
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 def read_records(path: Path) -> Iterator[bytes]:
     """Yields the records of a file. Raises: ConfigError naming an incomplete or altered record."""
-    with path.open("rb") as file:
+    with errors_name(path), path.open("rb") as file:
         number, size = 0, path.stat().st_size
         while head := file.read(12):
             name = f"{path}: record {number}"
