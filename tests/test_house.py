@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_512,
     "datagen": 8_932,
     "tools": 6_290,
-    "tests": 35_777,
+    "tests": 35_778,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

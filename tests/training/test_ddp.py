@@ -80,6 +80,7 @@ class Reference:
         path.mkdir()
         (path / "mapping.json").write_text(json.dumps(self.mapping(path)))
         (path / "faults.json").write_text(json.dumps(faults))
+        (path / "watch.json").write_text("{}")  # short intervals between counts: a rank waits three for a killed one
         return path
 
     def check(self, folder, exit_code):
