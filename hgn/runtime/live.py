@@ -15,11 +15,13 @@ import torch
 
 from hgn.network.barriers import Barriers
 from hgn.network.features import ParticleState
+from hgn.network.moving import MovingObstacles
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulation import joined
 from hgn.runtime.simulator import InitialState, Simulator, initial_states
 from hgn.scene.barrier import Barrier
 from hgn.scene.motion import Motion
+from hgn.scene.moving import MovingObstacle
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
 from hgn.schema import Vector, require, require_count, triple
@@ -54,6 +56,9 @@ class LiveSimulation:
         state = replace(state, barriers=self._joined(self._barriers))
         self.simulation = simulator.simulation(state, capacity, isolate=given is scenes)
         self._changed: ParticleState | None = None  # state from which the next frame starts; None without changes
+        self._numbers = [0] * len(self.scenes)  # each scene's `frame`, which `restore` of another scene does not change
+        # for `restore`: moving obstacles of each scene before each of its moves, with the frame of their keyframes
+        self._before_moves: list[list[tuple[int, tuple[MovingObstacle, ...]]]] = [[] for _ in self.scenes]
 
     def __enter__(self) -> LiveSimulation:
         return self
@@ -73,7 +78,7 @@ class LiveSimulation:
     @frame.setter
     def frame(self, frame: int) -> None:
         require_count("frame", frame, 0)
-        self.simulation.frame = frame
+        self.simulation.frame, self._numbers = frame, [frame] * len(self.scenes)
 
     @property
     def state(self) -> ParticleState:
@@ -92,8 +97,11 @@ class LiveSimulation:
         if self._changed is not None:
             self.simulation.continue_from(self._changed)
             self._changed = None
-        for _ in self.simulation.blocks(1):
-            pass
+        try:
+            for _ in self.simulation.blocks(1):
+                pass
+        finally:
+            self.frame = self.simulation.frame
         self.ended |= self.simulation.ended
         return self.state
 
@@ -149,7 +157,7 @@ class LiveSimulation:
         """Moves an obstacle evenly during the next frame, and ends its keyframes. It then rests until moved again.
 
         `number` counts the scene's obstacles with keyframes. Translation (domain units) and rotation (degrees) are
-        relative to its entry, as in a keyframe. `restore` does not move it back.
+        relative to its entry, as in a keyframe. Each move takes about 1 KB for `restore`, until `reset`.
         Raises: ConfigError if there is no such obstacle, and as keyframes do.
         """
         self._require_scene(index)
@@ -163,10 +171,8 @@ class LiveSimulation:
         later_33 = euler_rotation(triple(_array("rotation", np.array(rotation), (3,))))
         shift_T3 = np.stack([shift_3, _array("translation", np.array(translation), (3,))])
         own[number] = replace(own[number], motion=Motion(time_T, shift_T3, np.stack([turn_33, later_33]), before.pivot))
-        scenes = [*self.scenes]
-        scenes[index] = replace(scenes[index], moving=tuple(own))
-        moved = replace(moving, scenes=tuple(scene.moving for scene in scenes)).at(moving.frames)
-        self._changed, self.scenes = replace(self.state, moving=moved), scenes
+        self._before_moves[index].append((moving.frames[index], self.scenes[index].moving))
+        self._changed = replace(self.state, moving=self._moved(moving, moving.frames, index, own))
 
     def set_gravity(self, gravity: tuple[float, float, float], index: int = 0) -> None:
         """Replaces gravity, in domain units per second squared.
@@ -178,7 +184,8 @@ class LiveSimulation:
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int, index: int = 0) -> None:
         """Restores an earlier frame of a scene with its N particles of that time. Those that entered later are removed.
 
-        Obstacles and gravity stay; keyframes continue from that frame. `frame` becomes the number of the last frame.
+        Gravity and obstacles stay, but moving obstacles jump to their poses in that frame. Keyframes continue,
+        without the moves made since. `frame` becomes the number of the last frame.
 
         position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first.
         """
@@ -198,10 +205,21 @@ class LiveSimulation:
         )
         if state.moving is not None:
             frames = [*state.moving.frames]
-            frames[index] = max(0, frames[index] + frame - self.frame)
-            state = replace(state, moving=state.moving.at(frames))
-        self.simulation.frame = frame
+            frames[index] = max(0, frames[index] + frame - self._numbers[index])
+            own, moves = self.scenes[index].moving, self._before_moves[index]
+            while moves and moves[-1][0] >= frames[index]:
+                own = moves.pop()[1]
+            state = replace(state, moving=self._moved(state.moving, frames, index, own))
+        self.simulation.frame = self._numbers[index] = frame
         self._continue(state.selected(~mine_N), start)
+
+    def _moved(
+        self, moving: MovingObstacles, frames: Sequence[int], index: int, own: Sequence[MovingObstacle]
+    ) -> MovingObstacles:
+        """Gives the moving obstacles of scene `index` other motions, and returns those of all scenes at `frames`."""
+        self.scenes = [*self.scenes]
+        self.scenes[index] = replace(self.scenes[index], moving=tuple(own))
+        return replace(moving, scenes=tuple(scene.moving for scene in self.scenes)).at(frames)
 
     def _require_scene(self, index: int) -> None:
         last = len(self.scenes) - 1
@@ -254,6 +272,8 @@ class LiveSimulation:
                 changed[name][index] = 0 if own_S3 is None else own_S3[0]
         self._continue(replace(kept, **changed), replace(new, scene_N=new.scene_N + index))
         self.scenes, self._barriers = scenes, barriers
+        if "moving" in changed:
+            self._before_moves[index] = []
 
     def _continue(self, kept: ParticleState, new: ParticleState) -> None:
         """Takes kept and new particles, sorted by scene, for the next frame."""

@@ -270,6 +270,49 @@ def test_a_program_moves_obstacles():
         live.move_obstacle(0, (0.1, 0.1, 0.1))
 
 
+def test_restored_obstacles_are_where_they_were():
+    """After `restore` of each scene of a batch the same moves are the same motion bitwise; without them obstacles rest
+    at the frame's pose. Keyframes that a move had ended continue. Moves before other obstacles are not restored."""
+    drawn, frames = yaml.safe_load(SCENE), 10
+    drawn["obstacles"][0]["keyframes"] = [{"time": 0}, {"time": 0.1, "translation": [0.02, -0.02, 0]}]
+    begin = scene_of(drawn, "a.yaml")
+    simulator = Simulator(network_for(dtype=torch.float32), 60.0, "torch")
+    with LiveSimulation(simulator, [begin, begin]) as live:
+
+        def steps(first, moves=True):
+            path = []
+            for frame in range(first, frames):
+                if moves and frame >= 4:  # keyframes before
+                    for index in (0, 1):
+                        live.move_obstacle(0, (0.003 * frame, 0, -0.01 * index), (0, 4 * frame, 0), index)
+                path.append(live.step())
+                states.append(live.state)
+            return np.stack(path)
+
+        def restore(frame):
+            then = states[frame]
+            for index, rows in enumerate((then.scene_N == 0, then.scene_N == 1)):
+                live.restore(then.position_N3[rows].numpy(), then.velocity_NM3[rows].numpy(), frame, index)
+
+        states = [live.state]
+        path_TN3 = steps(0)
+        live.move_obstacle(0, (0.1, 0.1, 0.1), index=1)  # does not take effect
+        for frame in (8, 6, 2):
+            restore(frame)
+            np.testing.assert_array_equal(steps(frame), path_TN3[frame:])
+        restore(6)
+        place_V3 = states[6].moving.poses.place_V3
+        torch.testing.assert_close(live.state.moving.poses.place_V3, place_V3, rtol=0, atol=0)
+        steps(6, moves=False)
+        torch.testing.assert_close(live.state.moving.poses.place_V3, place_V3, rtol=0, atol=0)
+        assert not live.state.moving.poses.shift_V3.any()
+        live.replace_obstacles(begin, 0)
+        restore(2)
+        pivot_V3, place_V3 = states[0].moving.poses.pivot_V3, live.state.moving.poses.place_V3
+        torch.testing.assert_close(place_V3[:1], pivot_V3[:1], rtol=0, atol=0)
+        torch.testing.assert_close(place_V3[1:], states[2].moving.poses.place_V3[1:], rtol=0, atol=0)
+
+
 def test_obstacles_at_rest_are_sampled_once():
     """Scenes with the same obstacles at rest have the same cells and corners, which live scenes do not prepare again;
     with other obstacles, seeds or cells they have their own."""
