@@ -22,6 +22,7 @@ from hgn.system.ranks import first_on_machine, first_rank
 
 if TYPE_CHECKING:
     from hgn.network.base import ParticleNetwork
+    from hgn.runtime.weights import WeightsInfo
     from hgn.training.checkpoint import DamagedError, Resume
 
 
@@ -108,7 +109,15 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
     """
     from hgn.data.identity import dataset_identity, identity_hash
     from hgn.data.manifest import Manifest
-    from hgn.training.checkpoint import LAST_NAMES, DamagedError, Progress, Resume, check_checkpoint, read_checkpoint
+    from hgn.training.checkpoint import (
+        LAST_NAMES,
+        DamagedError,
+        Progress,
+        Resume,
+        check_checkpoint,
+        data_of_checkpoint,
+        read_checkpoint,
+    )
 
     damaged: DamagedError | None = None
     for path in (folder / name for name in LAST_NAMES if (folder / name).exists()):
@@ -130,10 +139,10 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
     progress = Progress.of(checkpoint)
     if first_rank():
         print(f"resuming at update {progress.updates}", file=sys.stderr)
-    return Resume(path, progress)
+    return Resume(path, progress, data_of_checkpoint(checkpoint).materials)
 
 
-def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetwork | None:
+def _initial_network(config: TrainConfig, resume: Resume | None) -> tuple[ParticleNetwork, WeightsInfo] | None:
     """Returns the network of training.init_weights for a new run. A resumed run takes the network of its checkpoint."""
     from hgn.training.checkpoint import network_of_weights
 
@@ -144,10 +153,10 @@ def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetw
         if first_rank():
             print(f"training.init_weights={weights} is not read: the run continues from {resume.path}", file=sys.stderr)
         return None
-    network = network_of_weights(config)
+    initial = network_of_weights(config)
     if first_rank():
         print(f"starting with the weights and the normaliser of {weights}", file=sys.stderr)
-    return network
+    return initial
 
 
 if __name__ == "__main__":

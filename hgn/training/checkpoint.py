@@ -20,7 +20,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.network.own_physics import physics_widths
 from hgn.renamed import current_names, with_step
-from hgn.runtime.weights import find_weights, load_weights, network_with
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, network_with
 from hgn.schema import (
     Bounded,
     ConfigError,
@@ -93,6 +93,7 @@ class Resume:
 
     path: Path
     progress: Progress
+    materials: tuple[str, ...]  # of the data, as in DataInfo
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -200,8 +201,10 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 FREE = ("network.inputs", "network.obstacle_distance")
 
 
-def network_of_weights(config: TrainConfig) -> ParticleNetwork:
+def network_of_weights(config: TrainConfig) -> tuple[ParticleNetwork, WeightsInfo]:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
+
+    Also returns the metadata of the file.
 
     Constraints may differ from those of the weights, and so may settings of FREE, which do not change tensors. If the
     weights lack inputs of own physics, the parameters of these inputs begin at 0: outputs without friction stay the
@@ -233,7 +236,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     mean_1H = row_MH.mean(0, keepdim=True).expand(len(ours.materials) - len(row_MH), -1)
     tensors["embedding.weight"] = torch.cat([row_MH, mean_1H])
     network.load_state_dict(tensors)
-    return network
+    return network, info
 
 
 def _begin(theirs: NetworkConfig, ours: NetworkConfig) -> bool:

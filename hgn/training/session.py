@@ -22,6 +22,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
 from hgn.runtime.torch_backend import precisions_to_try
+from hgn.runtime.weights import WeightsInfo
 from hgn.scene.kinds import fastest
 from hgn.scene.own_physics import own_ranges
 from hgn.schema import from_stored, printable, to_mapping
@@ -47,7 +48,7 @@ class Start:
     store: AnyStore
     resume: Resume | None  # the checkpoint to resume from
     # network whose parameters and normaliser the training starts from; None: random parameters, normaliser of the data
-    initial: ParticleNetwork | None
+    initial: tuple[ParticleNetwork, WeightsInfo] | None
     precompilation: Precompilation | None
 
 
@@ -151,24 +152,27 @@ def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[s
         config.scene.gravity,
         maximum_initial_speed=fastest(config.scene),
         own_ranges=own_ranges(config.scene.own_physics),
-        materials=_materials(config, start.store),
+        materials=_materials(config, start),
     )
     network = build_network(config.network, config.step)
     module = TrainingModule(network, config.training, data, backend, precisions=precisions)
     if start.initial is None:
         module.set_statistics(start.store.statistics())
     else:
-        module.load_weights(start.initial)
+        module.load_weights(start.initial[0])
     return module
 
 
-def _materials(config: TrainConfig, store: AnyStore) -> tuple[str, ...]:
-    """Returns the materials of the data. With training.init_weights, whose data had others, it returns none."""
-    if config.imported or config.training.init_weights is not None:
+def _materials(config: TrainConfig, start: Start) -> tuple[str, ...]:
+    """Returns the materials of the data, after those of the data of training.init_weights; empty: all."""
+    first = () if start.initial is None else start.initial[1].data_materials
+    earlier = first if start.resume is None else start.resume.materials
+    if config.imported or (start.resume is not None and not earlier):
         return ()
-    others = store.others if isinstance(store, PooledStore) else ()
+    others = start.store.others if isinstance(start.store, PooledStore) else ()
     scenes = (from_stored(SceneConfig, other.manifest.config["scene"], "scene") for other in others)
-    return (*dict.fromkeys(name for scene in (config.scene, *scenes) for name in scene.drawn_materials),)
+    own = (name for scene in (config.scene, *scenes) for name in scene.drawn_materials)
+    return (*dict.fromkeys((*earlier, *own)),)
 
 
 def _backend(config: TrainConfig, resume: Resume | None) -> tuple[str, tuple[str, ...], str]:

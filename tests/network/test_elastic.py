@@ -146,4 +146,4 @@ def test_a_simulation_keeps_the_rest_shape():
     weights, training = load_weights(find_weights("mechanics"))[0], TrainingConfig(init_weights="mechanics")
     config = replace(weights.config, own_physics=OWN["own_physics"], materials=MATERIALS)
     config = TrainConfig(network=config, step=weights.step, training=training)
-    assert torch.equal(network_of_weights(config)(plain), weights(plain))
+    assert torch.equal(network_of_weights(config)[0](plain), weights(plain))

@@ -78,6 +78,21 @@ def test_a_run_begins_with_weights(data, tmp_path, capsys):
     assert last(tmp_path / "run")["hgn"]["updates"] == 2
 
 
+def test_materials_of_the_first_weights_are_kept(make_config, make_dataset, tmp_path):
+    """A run has the materials of the data of its first weights and of its own data, also after it was resumed."""
+    config, path = make_config(training_scenes=2, validation_scenes=0, test_scenes=0), tmp_path / "first.safetensors"
+    config = replace(config, scene=replace(config.scene, materials=("sand",)))
+    make_dataset(config)
+    network, info = load_weights(weights_file(path))
+    for given, expected in ((("snow",), ["snow", "sand"]), ((), [*network.config.materials])):
+        save_weights(path, network, replace(info, materials=given))
+        for updates in (1, 2):
+            mapping = train_mapping(config, tmp_path / f"run{len(given)}", init_weights=str(path))
+            mapping["training"]["maximum_updates"] = updates
+            assert train.main(mapping) == 0
+            assert last(tmp_path / f"run{len(given)}")["hgn"]["data"]["materials"] == expected
+
+
 @pytest.mark.parametrize(
     ("file", "message"),
     [
@@ -104,7 +119,7 @@ def test_other_constraints_are_taken(tmp_path):
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
     wanted, step = NetworkConfig(**NETWORK | {"inputs": "local"}), StepConfig(0.1, (0.02, 0.04), 1e-3)
     config = TrainConfig(network=wanted, step=step, training=TrainingConfig(init_weights=str(path)))
-    network, (own, info) = network_of_weights(config), load_weights(path)
+    (network, _), (own, info) = network_of_weights(config), load_weights(path)
     assert (network.config, network.step, info.step) == (wanted, step, StepConfig())
     theirs = own.state_dict()
     assert all(torch.equal(tensor, theirs[name]) for name, tensor in network.state_dict().items())
