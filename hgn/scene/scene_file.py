@@ -75,7 +75,7 @@ class ObstacleEntry:
     position: Vector | None = None  # translation of a mesh (null: none), or centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
     friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
-    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; empty: the obstacle is at rest
+    keyframes: tuple[KeyframeEntry, ...] | None = None  # poses in order of time; null: the obstacle is at rest
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -94,8 +94,9 @@ class ObstacleEntry:
     @functools.cached_property
     def motion(self) -> Motion | None:
         """Returns the motion of the obstacle, or None."""
-        if not self.keyframes:
+        if self.keyframes is None:
             return None
+        require(len(self.keyframes) > 0, "keyframes", "at least one", [], "leave them out for an obstacle at rest")
         key_T7 = _without_half_turns(np.array([(k.time, *k.translation, *k.rotation) for k in self.keyframes]))
         rotation_T33 = np.array([euler_rotation(triple(degrees)) for degrees in key_T7[:, 4:].tolist()])
         return Motion(key_T7[:, 0], key_T7[:, 1:4], rotation_T33, self.position or (0.0, 0.0, 0.0))
@@ -109,7 +110,8 @@ def _without_half_turns(key_T7: np.ndarray) -> np.ndarray:
     turn_T3 = np.abs(np.diff(key_T7[:, 4:], axis=0))
     far_T = turn_T3.max(axis=1) >= 180
     rule = "of rotations less than 180 degrees apart, or different in one angle"
-    require(bool((np.count_nonzero(turn_T3[far_T], axis=1) == 1).all()), "keyframes", rule, "several")
+    wrong_T = np.flatnonzero(far_T & (np.count_nonzero(turn_T3, axis=1) > 1))[:1]
+    require(not len(wrong_T), "keyframes", rule, key_T7[np.append(wrong_T, wrong_T + 1), 4:].tolist())
     turns = float(turn_T3[far_T].sum()) / 360
     require(turns <= MOST_TURNS, "keyframes", f"of at most {MOST_TURNS} turns together", turns)
     piece_T = np.where(far_T, np.ceil(turn_T3.max(axis=1) / 120), 1).astype(int)
