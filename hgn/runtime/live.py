@@ -55,6 +55,7 @@ class LiveSimulation:
         self._barriers = [] if clearance is None else [scene.barrier(clearance) for scene in self.scenes]
         state = replace(state, barriers=self._joined(self._barriers))
         self.simulation = simulator.simulation(state, capacity, isolate=given is scenes)
+        self._closed = False
         self._changed: ParticleState | None = None  # state from which the next frame starts; None without changes
         self._numbers = [0] * len(self.scenes)  # each scene's `frame`, which `restore` of another scene does not change
         # for `restore`: moving obstacles of each scene before each of its moves, with the frame of their keyframes
@@ -68,6 +69,7 @@ class LiveSimulation:
 
     def close(self) -> None:
         """Returns the simulation's buffers to the backend, which uses them for the next simulation."""
+        self._closed = True
         self.simulation.close()
 
     @property
@@ -94,6 +96,7 @@ class LiveSimulation:
 
         Raises: DivergedError for a scene that is not in a list. The simulation can then only be restored or closed.
         """
+        self._require_scene(0)
         if self._changed is not None:
             self.simulation.continue_from(self._changed)
             self._changed = None
@@ -157,14 +160,14 @@ class LiveSimulation:
         """Moves an obstacle evenly during the next frame, and ends its keyframes. It then rests until moved again.
 
         `number` counts the scene's obstacles with keyframes. Translation (domain units) and rotation (degrees) are
-        relative to its entry, as in a keyframe. Each move takes about 1 KB for `restore`, until `reset`.
+        relative to its entry, as in a keyframe. It turns the shorter way, so less than half a turn in a frame. Each
+        move takes about 1 KB for `restore`, until `reset`.
         Raises: ConfigError if there is no such obstacle, and as keyframes do.
         """
         self._require_scene(index)
         moving, own = self.state.moving, [*self.scenes[index].moving]
         rule = f"0 to {len(own) - 1}, an obstacle" if own else "left out: the scene has no obstacles"
-        valid = isinstance(number, Integral) and 0 <= number < len(own)
-        require(valid, "number", f"{rule} with keyframes", number)
+        _require_index("number", number, len(own), f"{rule} with keyframes")
         assert moving is not None
         before, time_T = own[number].motion, (moving.frames[index] + np.arange(2)) * moving.frame_s
         turn_33, shift_3 = before.pose(time_T[0])
@@ -222,9 +225,8 @@ class LiveSimulation:
         return replace(moving, scenes=tuple(scene.moving for scene in self.scenes)).at(frames)
 
     def _require_scene(self, index: int) -> None:
-        last = len(self.scenes) - 1
-        valid = isinstance(index, Integral) and 0 <= index <= last
-        require(valid, "index", f"0 to {last}, a scene of the batch", index)
+        require(not self._closed, "simulation", "open", "closed", remedy="start another one")
+        _require_index("index", index, len(self.scenes), f"0 to {len(self.scenes) - 1}, a scene of the batch")
 
     def _started(self, scenes: Sequence[InitialState]) -> ParticleState:
         """Returns the start of scenes without their obstacles, which often do not change and are slow to prepare."""
@@ -295,6 +297,11 @@ def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     unusable = value[~np.isfinite(value)]
     require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
     return np.asarray(value)
+
+
+def _require_index(name: str, value: int, count: int, rule: str) -> None:
+    valid = isinstance(value, Integral) and not isinstance(value, bool) and 0 <= value < count
+    require(valid, name, rule, value)
 
 
 def _solid(scene: InitialState) -> tuple[Any, ...]:

@@ -258,6 +258,7 @@ def test_a_program_moves_obstacles():
             np.testing.assert_array_equal(live.step(), np.concatenate([still_TN3[frame], moved_TN3[frame]]))
         for number, place, message in (
             (2, places[1], "number must be 0 to 1, an obstacle with keyframes, got 2"),
+            (False, places[1], "number must be 0 to 1, an obstacle with keyframes, got False"),
             (1, ((0.1, 0.1),), r"translation must be of shape \(3,\), got \(2,\)"),
             (1, (places[1][0], (np.inf, 0, 0)), "rotation must be finite, got inf"),
         ):

@@ -131,8 +131,12 @@ def test_what_is_refused_changes_nothing():
             (lambda: live.restore(first.position_N3[:, :2], first.velocity_N3, 0), "position_N3 must be of shape"),
             (lambda: live.add_particles(None, None, None), "position_A3 must be a NumPy array, got 'NoneType'"),
             (lambda: live.set_gravity((0.0, 0.0, 0.0), index=0.5), "index must be 0 to 1, a scene of the batch, got 0"),
+            (lambda: live.set_gravity((0.0, 0.0, 0.0), index=True), "index must be 0 to 1, a scene of the batch, got"),
         ):  # fmt: skip
             with pytest.raises(ConfigError, match=message):
                 call()
         for path_TN3 in paths(live, 2):
             assert_alone(simulator, first, path_TN3)
+    for call in (live.advance, live.step, lambda: live.reset(0, first), lambda: live.set_gravity((0.0, 0.0, 0.0))):
+        with pytest.raises(ConfigError, match="simulation must be open, got 'closed'; start another one"):
+            call()
