@@ -1,7 +1,7 @@
 """Runs all commands: Hydra composes the config, and errors that a user can fix end in one line.
 
-Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input (also a pipe or
-device in place of a file or folder), 130 Ctrl-C, 143 SIGTERM, 141 closed output pipe (as in `… | head`).
+Exit codes: 0 success, 1 machine error (full disk, no permission), 2 invalid input (also a file, pipe or device in
+place of a folder, or the reverse), 130 Ctrl-C, 143 SIGTERM, 141 closed output pipe (as in `… | head`).
 """
 
 import atexit
@@ -15,7 +15,7 @@ import re
 import select
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, cast
@@ -33,12 +33,7 @@ _MACHINE_ERRORS = {
     errno.EACCES: "check the permissions",
     errno.EPERM: "check the permissions",
     errno.EROFS: "choose a folder that can be written to",
-    # A given path leads through a file, or names an object of another kind.
-    errno.EEXIST: "choose another path",
     errno.ENOENT: "check its folder or link",
-    errno.ENOTDIR: "choose another path",
-    errno.EISDIR: "choose another path",
-    errno.ENAMETOOLONG: "choose another path",
     errno.ETIMEDOUT: "check its server or disk",
     errno.ECONNABORTED: "free memory if the system ended them,",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
@@ -47,6 +42,8 @@ _MACHINE_ERRORS = {
     errno.ECHILD: "free some memory, or check the device,",
 }
 
+# A given path leads through a file, or names an object of another kind.
+_WRONG_PATHS = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 SHOW_KEYS = "--help shows the keys"
 Main = Callable[[dict[str, Any]], int | None]
@@ -104,6 +101,7 @@ class _Messages(io.FileIO):
 
 
 def _exit_code(main: Main | str, config_name: str) -> int:
+    mapping: dict[str, Any] = {}
     try:
         code = 0
         if {"--help", "-h"} & set(sys.argv[1:]):
@@ -125,10 +123,13 @@ def _exit_code(main: Main | str, config_name: str) -> int:
     except OSError as error:
         if _is_own_fault(error):
             raise
-        place = f": {error.filename}" if error.filename else ""
+        reason, wrong = error.strerror or str(error), error.errno in _WRONG_PATHS
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
-        code = EXIT_INPUT if error.errno == errno.ENAMETOOLONG or _is_special(error.filename) else EXIT_MACHINE
-        text = f"{error.strerror or error}{place}; {remedy} and run the same command again"
+        place = f": {error.filename}" if error.filename else ""
+        text = f"{reason}{place}; {'choose another path' if wrong else remedy} and run the same command again"
+        if wrong and (setting := _setting_of(str(error.filename), mapping)):
+            text = f"{setting[0]} must be another path, got {setting[1]!r}: {reason}"
+        code = EXIT_INPUT if wrong or _is_special(error.filename) else EXIT_MACHINE
         code = _fail(str(ConfigError(text)), code)  # ConfigError shortens the text
     except (MemoryError, RuntimeError, ImportError) as error:
         if not memory_is_full(error):
@@ -148,6 +149,22 @@ def _is_own_fault(error: OSError) -> bool:
         path = Path(os.fsdecode(error.filename))
         return path.parent.is_dir() and not path.is_symlink() and os.statvfs(path.parent).f_blocks > 0
     return isinstance(error, BrokenPipeError)
+
+
+def _setting_of(path: str, mapping: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Returns key and value of the setting that names a path, or else the nearest folder above or below it."""
+    nearest, found = 0, None
+    for key, value in mapping.items():
+        given = value
+        if isinstance(value, Mapping) and (inner := _setting_of(path, value)):
+            key, given = f"{key}.{inner[0]}", inner[1]
+        if not isinstance(given, str) or not given:
+            continue
+        ends = [str(Path(end).resolve()) for end in (path, given)]
+        common = os.path.commonpath(ends)
+        if common in ends and len(common) > nearest:
+            nearest, found = len(common), (key, given)
+    return found
 
 
 def _is_special(name: object) -> bool:

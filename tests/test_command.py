@@ -133,6 +133,27 @@ def test_pipes_and_devices_in_place_of_folders(tmp_path, command, monkeypatch, p
 
 
 @pytest.mark.parametrize(
+    ("value", "write", "seen"),
+    [
+        ("file", Path.mkdir, "'file': File exists"),
+        ("file/a/b", make_folder, "'file/a/b': "),
+        ("file", os.listdir, "'file': Not a directory"),
+        ("folder", Path.read_text, "'folder': Is a directory"),
+        ("folder/../file/x", lambda path: make_folder(path.absolute()), "'folder/../file/x': "),
+    ],
+)
+def test_paths_of_another_kind(tmp_path, command, monkeypatch, value, write, seen):
+    """A file in place of a folder, or the reverse, is invalid input (exit code 2); the line names its setting."""
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    Path("folder").mkdir()
+    code, _, error = command("train", f"dataset.folder={value}", "run=.", main=lambda _: write(Path(value)))
+    assert code == 2 and error.startswith(f"error: dataset.folder must be another path, got {seen}"), error
+    code, _, error = command("train", main=lambda _: Path("file").mkdir())
+    assert code == 2 and error == "error: File exists: file; choose another path and run the same command again\n"
+
+
+@pytest.mark.parametrize(
     ("content", "message"),
     [
         (HEAD + "name: x\nseed: [1\n", "must be a YAML file: line 4"),

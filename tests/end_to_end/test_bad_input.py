@@ -260,14 +260,14 @@ def test_diverging_scenes_are_told(place, capsys):
 @pytest.mark.parametrize(
     ("command", "arguments", "message"),
     [
-        ("rollout", [*ROLLOUT, "out=scene.yaml/rollout.vtkhdf"], "Not a directory: "),
-        ("rollout", [*ROLLOUT, "out=folder.vtkhdf"], "Is a directory: folder.vtkhdf"),
+        ("rollout", [*ROLLOUT, "out=scene.yaml/rollout.vtkhdf"], "out must be another path, got 'scene.yaml/r"),
+        ("rollout", [*ROLLOUT, "out=folder.vtkhdf"], "out must be another path, got 'folder.vtkhdf': Is a directory"),
         ("rollout", [*ROLLOUT, "out=closed/new/rollout.vtkhdf"], "Permission denied: "),
         ("rollout", [*ROLLOUT, "out=data"], "out must be a name that ends in"),
         ("rollout", [*ROLLOUT, f"out={'data' * 80}.vtkhdf"], "out must be a path of at most 4,095 bytes, 255 in each"),
-        ("evaluate", [*EVALUATE, "json=scene.yaml/errors.json"], "Not a directory: "),
+        ("evaluate", [*EVALUATE, "json=scene.yaml/errors.json"], "json must be another path, got 'scene.yaml/e"),
         ("export", [OF_THE_RUN, "out=data"], "data"),
-        ("train", ["run=scene.yaml"], "scene.yaml"),
+        ("train", ["run=scene.yaml"], "run must be another path, got 'scene.yaml'"),
     ],
 )
 def test_output_is_checked_before_the_work(place, command, arguments, message, capsys, monkeypatch):
