@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from hgn.schema import ConfigError, default_mapping, known_keys
+from hgn.schema import ConfigError, default_mapping, known_keys, require
 from hgn.system.yaml_files import read_yaml
 
 OPTIONS = (
@@ -129,12 +129,14 @@ def _check_options(arguments: list[str]) -> None:
     parser = get_args_parser()
     parser.exit_on_error = False
     try:
-        _, apart = parser.parse_known_args(arguments)
+        given, apart = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise ConfigError(f"Hydra's options must have the form --cfg job, got {error}") from None
     if apart:
         rule = "settings must be consecutive"
         raise ConfigError(f"{rule}, got {' '.join(apart)} separately; put all before or after Hydra's options")
+    folder = given.config_dir
+    require(folder is None or Path(folder).is_dir(), "--config-dir", "an existing folder", folder)
 
 
 def dataclass_of(file: Path) -> type | None:

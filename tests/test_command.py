@@ -87,6 +87,16 @@ def test_other_ways_to_choose_files(tmp_path, command, file, arguments, content)
     assert code == 2 and error.count("\n") == 1 and f"{file[-4:].strip('/')}.yaml must be a" in error
 
 
+@pytest.mark.parametrize("form", [["--config-dir", "folder"], ["--config-dir=folder"], ["-cd=folder"]])
+def test_missing_folders_of_configurations(tmp_path, monkeypatch, command, form):
+    """One line with the option, the rule and the folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    for name in ("nothere", "file"):
+        code, _, error = command("train", *(part.replace("folder", name) for part in form))
+        assert (code, error) == (2, f"error: --config-dir must be an existing folder, got '{name}'\n")
+
+
 def test_loops_of_defaults(tmp_path, command):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(HEAD + "defaults: [mine]\n")
