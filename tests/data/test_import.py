@@ -205,6 +205,8 @@ def test_a_gravity_that_the_flights_contradict_is_refused(factor, tmp_path):
     if factor not in (0.0, 1.05):
         with pytest.raises(ConfigError, match=r"gravity must agree with free flight, .* instead of \[0.0, -0.5, 0.0\]"):
             import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
+        with pytest.raises(ConfigError, match=r"instead of \[0.0, -2.22e-05, 0.0\]; check dt"):
+            import_trajectories.main(options(tmp_path / "mine", source, gravity=None, dt=2.5))
     given = None if factor in (0.0, 1.05) else gravity
     import_trajectories.main(options(tmp_path / "mine", source, gravity=given))
     assert Manifest.load(tmp_path / "mine").config["imported"]["gravity"] == gravity
@@ -228,7 +230,7 @@ def test_what_published_files_have(tmp_path):
     assert np.array_equal(first, 2.0 * np.arange(10)) and np.array_equal(second, first + 1)
 
 
-def test_a_radius_without_neighbours_is_refused(tmp_path, capsys):
+def test_a_radius_with_no_or_all_neighbours_is_refused(tmp_path, capsys):
     """By the radius that contains about 15; the mean is printed."""
     side = 0.3 + 0.04 * np.arange(5)
     lattice = np.stack(np.meshgrid(side, side, side), -1).reshape(-1, 3)
@@ -245,6 +247,13 @@ def test_a_radius_without_neighbours_is_refused(tmp_path, capsys):
     import_trajectories.main(options(tmp_path / "mine", source, radius=float(found[1])))
     (mean,) = re.findall(r"obstacles: yes, radius 0.0\d+ with (\d+) neighbours on average", capsys.readouterr().out)
     assert 10 <= int(mean) <= 20
+    side = 0.3 + 0.016 * np.arange(11)
+    lattice = np.stack(np.meshgrid(side, side, side), -1).reshape(1, -1, 3)
+    walk = lattice + 0.0001 * np.random.default_rng(0).normal(size=(9, 11**3, 3))
+    source = write(tmp_path / "dense", "plain", {"train": [(walk, np.full(11**3, 5), wall)]}, metadata())
+    message = r"radius must contain at most 1000 neighbours on average, got 1.3e\+03 within 0.3; radius=0.02\d contains"
+    with pytest.raises(ConfigError, match=message):
+        import_trajectories.main(options(tmp_path / "all", source, radius=0.3))
 
 
 def test_positions_in_another_unit_than_bounds_are_refused_for_bounds(tmp_path):
@@ -254,6 +263,9 @@ def test_positions_in_another_unit_than_bounds_are_refused_for_bounds(tmp_path):
     source = write(tmp_path / "foreign", "plain", simulations, metadata(gravity=list(GRAVITY)))
     with pytest.raises(ConfigError, match=r"bounds must contain the particles, .* 100% of .* in \[\[30\d.0, "):
         import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
+    large = options(tmp_path / "mine", source, radius=30, bounds=[[0, 1e5]] * 3)
+    with pytest.raises(ConfigError, match=r"bounds must be at most 100 times as wide as the .*, got .* in \[\[300.0, "):
+        import_trajectories.main(large)
 
 
 def flat_simulations(count=24):

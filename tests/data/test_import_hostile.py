@@ -149,6 +149,7 @@ def pickled(content):
         ("deepmind", meta(sequence_length=None), r"metadata.json: sequence_length must be a whole number, got None"),
         ("deepmind", meta(bounds=None), r"bounds must be given if .*metadata.json does not contain it"),
         ("deepmind", meta(bounds=[[0, 0.2]] * 3), r"bounds must contain the particles, got .* of .*record"),
+        ("plain", meta(bounds=[[0, 1]] * 2, dim=None, gravity=[0, -1, 0]), "2 finite numbers, one for each axis of b"),
         ("deepmind", meta(dt="soon"), r"metadata.json: dt must be a finite number, got 'soon'"),
         ("deepmind", meta(dim=2.5), r"metadata.json: dim must be 2 or 3, got 2.5"),
         ("deepmind", meta(bounds=[[0, 1], [0, 1], [0, float("inf")]]), r"bounds must be finite numbers in pairs"),

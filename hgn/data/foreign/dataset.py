@@ -15,7 +15,7 @@ from hgn.data.foreign.episodes import Converter, obstacle_cell_size
 from hgn.data.foreign.formats import find_format, read_split, set_info
 from hgn.data.foreign.gravity import estimate_gravity
 from hgn.data.foreign.settings import ImportConfig
-from hgn.data.foreign.trajectory import SetInfo, Trajectory, require_inside
+from hgn.data.foreign.trajectory import USUAL_NEIGHBOURS, SetInfo, Trajectory, require_inside
 from hgn.data.identity import identity_hash
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
@@ -27,7 +27,7 @@ from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 SHARD_BYTES = 128 << 20  # a shard ends with the episode that reaches this size
 LOOKED_AT = 4  # number of trajectories that give estimates of gravity, neighbours and the boundary particles' spacing
-USUAL_NEIGHBOURS = 15  # published sets have about 10 to 20
+MOST_NEIGHBOURS = 1000  # mean number; this project's data, with 8 particles per solver cell, have at most 400
 
 
 def import_set(
@@ -106,9 +106,10 @@ def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float
         except ConfigError:  # too few particles are in free flight
             continue
         if np.linalg.norm(estimated_3 - stored_3) > 0.1 * np.linalg.norm(stored_3):
+            estimated = [float(f"{value:.3g}") for value in estimated_3]
             raise ConfigError(
                 f"{trajectory.name}: gravity must agree with free flight, in length per second squared, got "
-                f"{stored_3.tolist()} instead of {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
+                f"{stored_3.tolist()} instead of {estimated}; check dt, or give gravity=…"
             )
     return info.gravity or stored[0]
 
@@ -128,7 +129,7 @@ def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
 def _neighbour_count(first: list[Trajectory], info: SetInfo) -> float:
     """Returns the mean number of neighbours of moving particles in the first and last frames.
 
-    Raises: ConfigError for a mean below 1, except if all trajectories have few particles.
+    Raises: ConfigError for a mean below 1 or above MOST_NEIGHBOURS, except if all trajectories have few particles.
     """
     counts: list[np.ndarray] = []
     usual: list[np.ndarray] = []  # radii with the usual number of neighbours
@@ -140,9 +141,10 @@ def _neighbour_count(first: list[Trajectory], info: SetInfo) -> float:
             if len(position_ND) > USUAL_NEIGHBOURS:
                 usual.append(tree.query(some_nD, k=[USUAL_NEIGHBOURS + 1])[0])
     mean = float(np.concatenate(counts).mean())
-    if usual and mean < 1:
+    if usual and not 1 <= mean <= MOST_NEIGHBOURS:
+        rule = "at least 1 neighbour" if mean < 1 else f"at most {MOST_NEIGHBOURS} neighbours"
         raise ConfigError(
-            f"radius must contain at least 1 neighbour on average, got {mean:.2g} within {info.radius:g}; "
+            f"radius must contain {rule} on average, got {mean:.2g} within {info.radius:g}; "
             f"radius={np.median(np.concatenate(usual)):.2g} contains about {USUAL_NEIGHBOURS}"
         )
     return mean
