@@ -40,6 +40,7 @@ _HTTP = ("http", "https")
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
+_AGAIN = "run the generator again, or import the set again"
 _outliving = threading.Event()
 _once = ContextVar("once", default=False)
 
@@ -205,7 +206,7 @@ class _Folder(Storage):
     ) -> Path:
         path = self._folder / name
         try:
-            verify_file(path, sha256, size, "delete it and run the generator again")
+            verify_file(path, sha256, size, f"use an intact copy, or delete it and {_AGAIN}")
         except FileNotFoundError:
             raise _missing(path) from None
         return path
@@ -384,7 +385,7 @@ def _cut(path: str, size: int, got: int) -> StorageError:
 
 
 def _missing(path: Path | str) -> StorageError:
-    return StorageError(f"{path} is listed in the index but missing; run the generator again")
+    return StorageError(f"{path} is listed in the index but missing; {_AGAIN}")
 
 
 def _transient(error: Exception, url: str) -> str | None:
@@ -405,7 +406,7 @@ def _transient(error: Exception, url: str) -> str | None:
             "it; object stores need their own credentials, the Hugging Face Hub needs HF_TOKEN)"
         ) from None
     if status == 410:
-        raise StorageError(f"{url} is damaged on its server; delete it there and run the generator again") from None
+        raise StorageError(f"{url} is damaged on its server; delete it there and {_AGAIN}") from None
     if lasting:
         raise StorageError(f"{url} must be a file of a data set, got status {status}; check dataset.folder") from None
     packages = {kind.__module__.partition(".")[0] for kind in type(error).__mro__}

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from hgn.schema import printable, require
+from hgn.schema import ConfigError, printable, require
 
 VARIABLE = "HGN_PATIENCE_S"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
@@ -95,7 +95,8 @@ def patiently(
                 raise UnreachableError(url, patience_s, cause) from error
             if not warned and pause > 1:
                 warned = True
-                text = f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s"
-                print(printable(text), file=sys.stderr)
+                # a ConfigError names a file that was read, and its fault
+                fault = cause if isinstance(error, ConfigError) else f"{server} does not answer ({cause})"
+                print(printable(f"{fault}; retrying for {patience_s:.0f} s"), file=sys.stderr)
             ended.wait(pause * random.uniform(0.5, 1.0))  # spreads the readers' retries in time
             pause = min(2 * pause, LONGEST_PAUSE_S)

@@ -196,6 +196,21 @@ def test_files_that_are_away_for_a_moment(data, away, opened, monkeypatch):
     timer.join()
 
 
+def test_a_file_that_stays_altered(data, capsys, monkeypatch):
+    """The line about the wait and the error say what is wrong with it, and not that its folder does not answer."""
+    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 1.01)
+    monkeypatch.setenv(VARIABLE, "1.5")
+    store = EpisodeStore(data.dataset.folder, "train")
+    fault = r"train-.*\.tar must have sha256 .*: it was altered; use an intact copy, or delete it and .* import the set"
+    with (
+        AWAY["altered"](store.manifest.shards[0].name)(Path(data.dataset.folder)),
+        pytest.raises(ConfigError, match=fault),
+        faults_outlived(),
+    ):
+        _ = store[0]
+    assert re.search(fault + " again; retrying for 2 s", told := capsys.readouterr().err) and "answer" not in told
+
+
 class Server(Quiet, http.server.SimpleHTTPRequestHandler):
     """A file server that answers each request with the next of `answers` first."""
 
