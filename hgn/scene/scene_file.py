@@ -75,7 +75,7 @@ class ObstacleEntry:
     position: Vector | None = None  # translation of a mesh (null: none), or centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
     friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
-    keyframes: tuple[KeyframeEntry, ...] | None = None  # poses in order of time; null: the obstacle is at rest
+    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; left out: the obstacle is at rest
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -94,9 +94,8 @@ class ObstacleEntry:
     @functools.cached_property
     def motion(self) -> Motion | None:
         """Returns the motion of the obstacle, or None."""
-        if self.keyframes is None:
+        if not self.keyframes:
             return None
-        require(len(self.keyframes) > 0, "keyframes", "at least one", [], "leave them out for an obstacle at rest")
         key_T7 = _without_half_turns(np.array([(k.time, *k.translation, *k.rotation) for k in self.keyframes]))
         rotation_T33 = np.array([euler_rotation(triple(degrees)) for degrees in key_T7[:, 4:].tolist()])
         return Motion(key_T7[:, 0], key_T7[:, 1:4], rotation_T33, self.position or (0.0, 0.0, 0.0))
@@ -280,7 +279,11 @@ def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
     """Returns the scene of a file's content. Meshes are relative to `path`. Raises: ConfigError as load_scene."""
     content = {key: value for key, value in mapping.items() if key != MEASURE}
     try:
-        return _build(from_mapping(SceneFile, content), Path(path).parent)
+        file = from_mapping(SceneFile, content)
+        for index, entry in enumerate(content.get("obstacles", ())):
+            name, remedy = f"obstacles[{index}].keyframes", "leave them out for an obstacle at rest"
+            require(entry.get("keyframes") != [], name, "at least one", [], remedy)
+        return _build(file, Path(path).parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
