@@ -61,7 +61,7 @@ def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch):
     monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
     config = MpmConfig(device="cuda")
     expected = solver.simulate([_scene()], config, 11, 60.0, team=solver.Team(0))
-    with pytest.warns(RuntimeWarning, match="does not run 4000 blocks"):
+    with pytest.warns(RuntimeWarning, match="does not run the 4000 blocks"):
         found = solver.simulate([_scene()], config, 11, 60.0, team=solver.Team(512, 4000))
     _require_alike(expected, found)
 
