@@ -234,6 +234,8 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     assert list(judged) == [row["case"] for row in rows]
     assert not judged["tiny: height, frames 5 to 10"]["held"]
     assert judged["tiny: far_effect, frame 10"]["measured"] == 0.0
+    centre = judged["tiny: centre, group 1, frames 5 to 10"]  # tight bounds can be told apart in the printed text
+    assert [float(x) for x in centre["predicted"].split(" to ")] == pytest.approx([centre["low"], centre["high"]], 1e-4)
     assert judged["tiny: height, frames 5 to 10"]["solver"] == pytest.approx(rows[0]["solver"]["64"], rel=1e-3)
     tiny_file(tmp_path, bounds=[{"of": "height", "frames": [10, 10], "within": 90.0}])
     assert network.main(options | {"json": str(shown)}) == 0
@@ -300,13 +302,16 @@ def test_one_scene(tmp_path, monkeypatch, capsys):
     printed, again = solve("gallery", file=tmp_path / "again.json")
     assert not simulated and [again[key] for key in ("rows", "scenes")] == [before[key] for key in ("rows", "scenes")]
 
-    shown = dict(files)
+    shown, before["meta"]["date"] = dict(files), "2001-01-01T00:00:00+00:00"
+    json_file.write_text(json.dumps(before))
     printed, after = solve("gallery:mine", "gallery:z")
     assert len(simulated) == 4 and len(printed) == 7 and printed[-1] == "6 of 6 rows pass"
     assert all(line.startswith(("passes mine: ", "passes z: ")) for line in printed[:-1])
     assert list(after["scenes"]) == ["a", "c", "mine", "z"]
     assert [row["scene"] for row in after["rows"]] == [name for name in after["scenes"] for _ in range(3)]
-    assert after["scenes"].pop("mine") and json.dumps(after["scenes"]) == json.dumps(before["scenes"])
+    assert after["meta"] == before["meta"], "it describes the rows that were copied"
+    assert after["scenes"].pop("mine")["simulated"]["date"] > before["meta"]["date"]
+    assert json.dumps(after["scenes"]) == json.dumps(before["scenes"])
     assert json.dumps([row for row in after["rows"] if row["scene"] != "mine"]) == json.dumps(before["rows"])
 
     printed, judged = check("gallery:mine")

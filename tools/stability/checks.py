@@ -62,7 +62,7 @@ def gallery_rows(outcome: Outcome, more: dict[str, Any]) -> list[Row]:
         low, high = bound.interval(solver)
         details: dict[str, Any] = {"scene": case.name, "kind": gallery.measure.kind, "observable": bound.of}
         details |= {"low": low, "high": high, "solver": solver} | more
-        name, predicted = f"{case.name}: {bound.label}", interval_text(low, high)
+        name, predicted = f"{case.name}: {bound.label}", interval_text(low, high, digits=5)
         if cause is not None:
             rows.append(Row(name, predicted, "diverged", False, cause, details))
             continue
@@ -70,7 +70,7 @@ def gallery_rows(outcome: Outcome, more: dict[str, Any]) -> list[Row]:
             measured[bound.key] = series(film, bound)
         figure = bound.reduced(measured[bound.key])
         passes = low <= figure <= high
-        note = f"{'within' if passes else 'outside of'} its bounds; solver {solver:.3g}"
+        note = f"{'within' if passes else 'outside of'} its bounds; solver {solver:.5g}"
         rows.append(Row(name, predicted, figure if math.isfinite(figure) else "none", passes, note, details))
     return rows
 
@@ -110,8 +110,9 @@ def _values(figure: Any, field: str) -> Iterator[tuple[str, float]]:
             yield f" ({', '.join(places)})" if places else "", record[field]
 
 
-def interval_text(low: float, high: float) -> str:
+def interval_text(low: float, high: float, digits: int = 3) -> str:
     """Returns two bounds in words."""
+    least, most = f"{low:.{digits}g}", f"{high:.{digits}g}"
     if low == -math.inf:
-        return f"at most {high:.3g}"
-    return f"at least {low:.3g}" if high == math.inf else f"{low:.3g} to {high:.3g}"
+        return f"at most {most}"
+    return f"at least {least}" if high == math.inf else f"{least} to {most}"

@@ -38,14 +38,18 @@ SIMULATED = ("device", "commit", "date")  # keys of the report's meta that each 
 def gallery_rows(draw: str, chosen: Mapping[str, GalleryCase], mpm: MpmConfig, report: Report) -> Iterator[Row]:
     """Yields a row for each bound of the chosen scenes of a draw, and adds the other scenes to the report.
 
+    With other scenes the report keeps its earlier `meta`. The entry of each scene has the commit that simulated it.
     Raises: ConfigError if the other scenes were simulated with other settings of the solver.
     """
     again: list[GalleryCase] = []
+    simulated = {name: report.meta.get(name) for name in SIMULATED}
     file, others = REFERENCE / f"{draw}_solver.json", scene_files(GALLERY).keys() - chosen.keys()
     remedy = "move it, and run python -m tools.stability solver again"
     with damage_named(f"{file} must be a report of tools.stability solver", remedy):
         earlier = _earlier(file, mpm, others)
         scenes = report.more["scenes"]
+        if not others.isdisjoint(earlier["scenes"]):
+            report.meta = earlier["meta"]
         scenes |= {name: entry for name, entry in earlier["scenes"].items() if name in others}
         report.rows += [row for row in earlier["rows"] if row.get("scene") in others]
         broken = {row["case"]: row["broken"] for row in earlier["rows"] if "broken" in row}
@@ -59,7 +63,7 @@ def gallery_rows(draw: str, chosen: Mapping[str, GalleryCase], mpm: MpmConfig, r
             yield from _rows(each, entry, [broken[name] for name in names])
     launches = groupby(sorted(again, key=_launch), _launch)
     for each, films, causes, frictionless in chain.from_iterable(_launched(list(some), mpm) for _, some in launches):
-        entry = {"simulated": {name: report.meta[name] for name in SIMULATED}, "kind": each.measure.kind}
+        entry = {"simulated": simulated, "kind": each.measure.kind}
         entry |= {"digest": each.digest, "series": {}, "particles": each.scenes[0].particle_count}
         scenes[each.name] = entry
         if causes:
