@@ -22,7 +22,6 @@ from hgn.scene.group import WALL_CELLS, Region, fill, particle_count
 from hgn.scene.history import velocity_after
 from hgn.scene.material import MATERIALS, material_index
 from hgn.scene.mesh import load_mesh
-from hgn.scene.own_physics import NOMINAL_P
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
@@ -332,22 +331,15 @@ class PlaySession:
         rate = self.simulator.frame_rate_hz
         require(simulator.frame_rate_hz == rate, "weights", f"for {rate} frames per second", simulator.frame_rate_hz)
         newest, history_NM3 = self.newest, self.recording.history(self.frame)
-        first, count = self.live.scenes[0], len(newest.position_N3)
-        known, bodies = first.parameters, first.body_N
-        if known is not None:  # added particles have the defaults
-            known = np.concatenate([known, np.tile(np.array(NOMINAL_P, np.float32), (count, 1))[len(known) :]])[:count]
-        if bodies is not None:
-            bodies = np.append(bodies, np.full(max(count - len(bodies), 0), bodies.max(initial=-1) + 1))[:count]
-        now = replace(
-            first,
-            position_N3=newest.position_N3,
-            velocity_N3=self._velocities(),
-            material_N=self.materials(),
-            past_HN3=None,
-            parameters=known,
-            body_N=bodies,
-        )
+        first, velocity_N3 = self.live.scenes[0].selected(slice(len(newest.position_N3))), self._velocities()
+        count = len(first.position_N3)
+        now = replace(first, position_N3=newest.position_N3[:count], velocity_N3=velocity_N3[:count], past_HN3=None)
         live = LiveSimulation(simulator, now, self.maximum_particles)
+        try:
+            live.add_particles(newest.position_N3[count:], velocity_N3[count:], self.materials()[count:])
+        except ConfigError:  # a material of added particles
+            live.close()
+            raise
         if live.state.velocity_NM3.shape[1] == history_NM3.shape[1]:
             live.restore(newest.position_N3, history_NM3, self.frame)
         live.frame = self.frame
