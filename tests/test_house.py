@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_584,
     "datagen": 8_932,
     "tools": 6_295,
-    "tests": 35_902,
+    "tests": 35_917,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

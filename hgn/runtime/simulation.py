@@ -85,11 +85,11 @@ class Simulation:
     @property
     def state(self) -> ParticleState:
         """Returns the state after the last frame, without ended scenes; read-only."""
+        state = replace(self._state, moving=self._state.moving and self._state.moving.later(self._passed))
         if self.stepper is None:
-            return self._state
+            return state
         position_N3, velocity_NM3 = self.stepper.motion()
-        moving = self._state.moving and self._state.moving.later(self._passed)
-        return replace(self._state, position_N3=position_N3, velocity_NM3=velocity_NM3, moving=moving)
+        return replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
 
     @property
     def particle_count(self) -> int:
@@ -151,11 +151,8 @@ class Simulation:
 
     def _blocks(self, end: int) -> Iterator[torch.Tensor]:
         while self.frame < end:
-            if len(self.ended) == self._state.scene_count:
-                count, self.frame = end - self.frame, end
-                yield self._whole(self._state.position_N3[None].expand(count, -1, -1))
-            elif self.stepper is None:  # no particles yet
-                self.frame += 1
+            if self.stepper is None:  # no particles yet, or all scenes have ended
+                self._count(1)
                 yield self._whole(self._state.position_N3[None])
             else:
                 yield from self._stepped(self.stepper, end - self.frame)
@@ -163,8 +160,7 @@ class Simulation:
     def _stepped(self, stepper: Stepper, frames: int) -> Iterator[torch.Tensor]:
         try:
             for block_TN3, lost in stepper.blocks(frames):
-                self.frame += len(block_TN3)
-                self._passed += len(block_TN3)
+                self._count(len(block_TN3))
                 if not lost:
                     yield self._whole(block_TN3)
                 elif self.isolate:
@@ -174,8 +170,12 @@ class Simulation:
                     count = int(self._diverged(block_TN3[-1]).sum())
                     raise DivergedError(self.frame, describe_diverged(count, block_TN3.shape[1]))
         except GridRangeError as error:
-            self.frame += 1
+            self._count(1)
             raise DivergedError(self.frame, str(error)) from None
+
+    def _count(self, frames: int) -> None:
+        self.frame += frames
+        self._passed += frames
 
     def _begin(self, state: ParticleState) -> None:
         self._state, self._passed = state, 0  # _passed: number of frames since `state`

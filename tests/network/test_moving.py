@@ -314,6 +314,21 @@ def test_restored_obstacles_are_where_they_were():
         torch.testing.assert_close(place_V3[1:], states[2].moving.poses.place_V3[1:], rtol=0, atol=0)
 
 
+def test_obstacles_move_before_particles_enter():
+    """With an emitter only particles move as beside others that are far away; a live scene that is empty, too."""
+    drawn = yaml.safe_load(SCENE)
+    disc = {"shape": "disc", "size": 0.05, "position": [0.5, 0.56, 0.5], "velocity": [0, -0.5, 0], "material": "snow"}
+    drawn |= {"groups": [], "emitters": [disc | {"start": 0.1, "stop": 0.12}]}
+    simulator, empty = Simulator(network_for(dtype=torch.float32), 60.0, "torch"), scene_of(drawn, "a.yaml")
+    drawn["groups"] = [{"shape": "cube", "size": 0.02, "position": [0.1, 0.9, 0.1], "material": "water"}]
+    alone_TN3, beside_TN3 = (simulator.rollout([scene], 16)[0] for scene in (empty, scene_of(drawn, "a.yaml")))
+    np.testing.assert_allclose(alone_TN3, beside_TN3[:, -alone_TN3.shape[1] :], rtol=0, atol=1e-6)
+    with LiveSimulation(simulator, replace(InitialState.of(empty), emitting=None)) as live:
+        for _ in range(8):
+            live.step()
+        assert live.state.moving.frames == (8,)
+
+
 def test_obstacles_at_rest_are_sampled_once():
     """Scenes with the same obstacles at rest have the same cells and corners, which live scenes do not prepare again;
     with other obstacles, seeds or cells they have their own."""
