@@ -1,4 +1,4 @@
-"""Triton's interpreter without what it does again and again, or for nothing; kernels compute the same in it."""
+"""Makes Triton's interpreter faster: it omits repeated and useless work. Kernels compute the same results."""
 
 import functools
 import inspect

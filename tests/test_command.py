@@ -1,4 +1,4 @@
-"""What all commands share: how settings and files of settings are read, and what becomes of their output."""
+"""Tests what all commands have in common: reading of settings and their files, and output."""
 
 import io
 import os
@@ -40,7 +40,7 @@ def command(monkeypatch, capsys):
     ],
 )
 def test_names_that_hydra_refuses(given, meant, monkeypatch):
-    """Files and folders are called what people call them; what stands beside them is taken as ever."""
+    """Names of files and folders may contain characters of Hydra's syntax. Other arguments are read as usual."""
     monkeypatch.setattr("sys.argv", ["error_vs_time", f"data={given}", "out=x", "weights=null", "mpm_steps=[0.1]"])
     (composed,) = _compose("error_vs_time")
     assert composed["data"] == meant and composed["weights"] is None and composed["mpm_steps"] == [0.1]

@@ -1,4 +1,4 @@
-"""Rules of settings: what breaks one is refused in a line that says field, rule and value."""
+"""Tests the rules of settings: an error is one line with field, rule and value."""
 
 import pytest
 

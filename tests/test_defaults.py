@@ -1,4 +1,6 @@
-"""What the commands compose to: defaults stand once, in the dataclasses, and experiments say what differs."""
+"""Tests the composed settings of all commands: dataclasses define the defaults once, and experiments contain only
+differences.
+"""
 
 import inspect
 import sys
@@ -78,7 +80,7 @@ def test_all_take_the_same_weights():
 
 @pytest.mark.parametrize(("scene", "message"), [("funel", "did you mean funnel"), ("my.yaml", "existing YAML file")])
 def test_play_answers_a_mistyped_scene_before_it_loads_weights(monkeypatch, scene, message):
-    """Neither PyTorch nor the weights are loaded first, which takes long on a busy machine."""
+    """A wrong scene name is refused before PyTorch and the weights are loaded, which takes long on a busy machine."""
     monkeypatch.setitem(sys.modules, "hgn.runtime.simulator", None)
     with pytest.raises(ConfigError, match=message):
         play.play_page(play.PlayConfig(scene=scene))

@@ -129,7 +129,7 @@ def test_identity_keeps_its_names(monkeypatch, removed):
 
 
 def test_the_table_is_sound():
-    """What it calls removed is no setting, and what it renames to is one."""
+    """No removed setting in the table is a present setting, and each new name is one."""
     fields = {f"{section_of(cls)}.{name}" for cls in SECTIONS for name in to_mapping(cls())}
     assert not fields & (REMOVED.keys() | KEYS.keys())
     assert all(key in fields for key in KEYS.values() if key.startswith(("scene.", "mpm.", "network.")))

@@ -1,8 +1,7 @@
-"""A Python that has the training stack loaded: each program that it is asked to run is a fork of it.
-
-Loading PyTorch and Lightning takes seconds, and the tests start dozens of trainings. `python warm_server.py LISTENER`
-loads them once and forks, before any thread or device exists, for each request of warm_client.py, which stands in for
-the interpreter: same arguments, folder, environment, network, standard streams, signals and exit status.
+"""Runs programs as forks of a Python process with the training stack loaded, because loading PyTorch and Lightning
+takes seconds and the tests start dozens of trainings. `python warm_server.py LISTENER` loads them once and, before any
+thread or device exists, forks for each request of warm_client.py, which replaces the interpreter: arguments, folder,
+environment, network, standard streams, signals and exit status are the same.
 """
 
 import atexit

@@ -44,7 +44,8 @@ def hub(tmp_path, cache, monkeypatch):
     "url", ["hf://one/net", "hf://one/net/net.safetensors", "hf://one/net@main", "hf://one/two/b.safetensors"]
 )
 def test_weights_come_from_a_repository(url, hub):
-    """By the file's name, or where there is one alone; they are the file's, and a second asking brings nothing."""
+    """Weights are read by the file's name, or without a name if the repository has only one file. Their content is the
+    file's, and a second read downloads nothing."""
     path = find_weights(url)
     place = HubPlace.parse(url, "weights")
     stored = hub.folder / "models" / place.repository / path.name
@@ -165,8 +166,8 @@ def test_cards_are_the_hubs(hub, folder):
 
 
 def test_a_card_is_of_the_weights_beside_it(hub, tmp_path):
-    """Another file of that name is not taken for a copy, were it an older one or one that was cut: nothing is written
-    beside it."""
+    """A different file with the name of the weights, for example an older or a cut one, is not taken for a copy, and no
+    card is written next to it."""
     weights = hub.folder / "models" / "one" / "net" / "net.safetensors"
     folder = tmp_path / "folder"
     folder.mkdir()

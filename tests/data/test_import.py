@@ -115,7 +115,8 @@ def test_gravity_is_estimated_from_what_flies(gravity):
 
 
 def test_gravity_that_the_metadata_contradict_is_refused(tmp_path):
-    """LagrangeBench says its size alone; zero is taken, another is compared with what flies."""
+    """LagrangeBench stores only the size of gravity. Zero is accepted, and other sizes are compared with free flight in
+    the data."""
     time_T11 = np.arange(40)[:, None, None] / 60
     path = (0.5 + np.zeros((40, 30, 3)) - 0.5 * np.array([0, 0.2, 0]) * time_T11**2).astype(np.float32)
     for size, expected in ((0.0, (0.0, 0.0, 0.0)), (0.2, (0.0, -0.2, 0.0)), (1.0, None)):
@@ -325,7 +326,7 @@ def test_a_flat_set_is_one_layer(flat):
 
 @pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"kind": "gns", "levels": 1}])
 def test_a_flat_simulation_stays_in_its_plane(changes, flat):
-    """Whatever a network says, z is the same in every frame, bit by bit; the start is the set's own six frames."""
+    """For any network z is bitwise the same in every frame. The start is the set's first six frames."""
     manifest = Manifest.load(flat)
     torch.manual_seed(0)
     network = build_network(network_of(manifest, **changes))

@@ -78,7 +78,7 @@ def moving(array):
 
 
 def claimed(folder):
-    """A file of few bytes that says of itself that it holds 7 TiB."""
+    """Returns a file of few bytes whose header claims 7 TiB."""
     with h5py.File(folder / "train.h5", "a") as file:
         del file["00000/position"]
         file.create_dataset("00000/position", (10**6, 10**6, 2), "f4", chunks=(1, 1000, 2))

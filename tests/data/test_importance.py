@@ -42,7 +42,7 @@ def test_what_happens_is_drawn_more_often(share):
 
 
 def test_one_epoch_covers_the_distribution():
-    """Slots are strata: in every epoch a frame comes as often as its chance says, to within one."""
+    """Draws are stratified: in every epoch the number of draws of a frame equals its expectation to within one."""
     importance = FrameImportance.of(stopped(31, 12), 0.6)
     chance = np.diff(importance.draws.cumulative_F, prepend=0.0)
     for epoch in range(5):

@@ -101,8 +101,8 @@ def small_segments(monkeypatch):
 
 
 def test_every_way_to_read(tmp_path, small_segments):
-    """However it was appended to and from wherever it is read, an index has the shards in their order; each episode is
-    found; what was known is a beginning of what came later, and of nothing else."""
+    """An index lists its shards in order, for any sequence of appends and any start of reading. Each episode is found.
+    An earlier state is a beginning of a later state of the same index, and of no other index."""
     shards = [shard(i) for i in range(11)]
     for step in (1, 2, 4, 11):
         folder = tmp_path / str(step)
@@ -127,7 +127,8 @@ def test_every_way_to_read(tmp_path, small_segments):
 
 
 def test_what_was_not_published_is_written_over(tmp_path, small_segments):
-    """Lines behind what the head says, of a writer that ended before it wrote the head, do not count."""
+    """Lines after the end that the head states, of a writer that ended before it wrote the head, are ignored and
+    overwritten."""
     index = extend(tmp_path, begin(tmp_path), [shard(0), shard(1)])
     extend(tmp_path, index, [shard(7), shard(8)])
     index = extend(tmp_path, index, [shard(2), shard(3)])
@@ -158,7 +159,7 @@ def test_a_list_that_is_written_anew_again(tmp_path, monkeypatch):
     ],
 )
 def test_index_that_was_altered(folder, pattern, text, message):
-    """Lines that do not add up to what the manifest says are refused; what is behind them is not read."""
+    """Lines that contradict the manifest are refused, and later lines are not read."""
     path = folder / "index" / "1-000000.jsonl"
     path.write_text(re.sub(pattern, text, path.read_text(), count=1))
     store = EpisodeStore(folder, "train")

@@ -61,8 +61,8 @@ def test_identity(make_config):
 
 
 def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeypatch):
-    """On NFS a file that another machine has replaced is lost to whoever had opened it: reader, writer and service read
-    the one in its place."""
+    """On NFS an open file is lost when another machine replaces it. Reader, writer and service then read the new
+    file."""
     real, lost = files.open_at_once, 0
 
     def opened(path):

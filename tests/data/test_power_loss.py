@@ -1,9 +1,9 @@
-"""Published shards, saved checkpoints and cached shards survive a loss of power, a kill and a failing disk.
+"""Tests that published shards, saved checkpoints and cached shards survive a loss of power, a kill and a failing disk.
 
 Python's file system calls are intercepted while data are written. Before a call the folder is copied as a disk may
-contain it after a power loss: bytes are there if the file was synced, names if their folder was; all others may be
-there, lost, cut or zeroed. POSIX guarantees no more, nor do some file systems (Pillai et al., OSDI 2014). Everything
-published or saved must be in each copy, and the next run must complete it, bitwise.
+contain it after a power loss: it contains bytes if the file was synced, and names if their folder was. Other bytes and
+names may be there, lost, cut or zeroed, because POSIX and some file systems guarantee no more (Pillai et al., OSDI
+2014). Each copy must contain everything published or saved, and the next run must complete it, bitwise.
 """
 
 import builtins

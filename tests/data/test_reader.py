@@ -51,8 +51,8 @@ def test_store_travels_to_workers(folder):
 
 
 def test_store_grows_with_the_dataset(make_config, make_dataset):
-    """Refreshing appends new episodes, of their own lengths, and keeps the places of those that were there; a data set
-    that holds nothing yet can be opened. Only the three splits exist."""
+    """Refreshing appends new episodes, which may have other lengths, and keeps the indices of earlier ones. A data set
+    without episodes can be opened. Only the three splits exist."""
     with DatasetWriter(make_config(training_scenes=3, long_fraction=0.4, long_frames=9)) as writer:
         assert EpisodeStore.available(writer.folder) and len(EpisodeStore(writer.folder, "train")) == 0
     folder = make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
@@ -80,7 +80,7 @@ def test_shards_are_hashed_once(folder, monkeypatch):
 
 
 def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_path):
-    """A folder whose data set was replaced, or lost shards, is not read on as if nothing had happened."""
+    """Refreshing fails if the folder's data set was replaced, or has lost shards."""
     store = EpisodeStore(folder, "train")
     manifest = Manifest.load(folder)
     manifest.save(folder, manifest.shards[1:])

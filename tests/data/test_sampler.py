@@ -93,8 +93,8 @@ def test_epochs_and_seeds_differ():
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(2, 5), min_size=1, max_size=60), st.integers(1, 40), st.integers(1, 4), st.integers(0, 99))
 def test_windows(frames, window, world_size, cut):
-    """With a window each sample still comes once an epoch, on any number of ranks and through an interruption; between
-    two samples of an episode lie no more than those of a window's episodes; what comes next is known in its order."""
+    """With a window each sample is drawn once an epoch, on any number of ranks and after an interruption. Two samples
+    of an episode are at most one window of episodes apart. The next samples are known in their order."""
     total = sum(frames) - len(frames)
 
     def ranks(state=None):

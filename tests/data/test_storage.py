@@ -162,7 +162,7 @@ def partial_of(entry, cache):
 
 @pytest.mark.parametrize("left", [b"", b"prefix", b"garbage", b"too long"])
 def test_fetching_goes_on_where_it_ended(folder, cache, left, monkeypatch):
-    """What a killed process had fetched is kept, unless it is not what it should be."""
+    """Bytes that a killed process had fetched are used, unless they are wrong."""
     monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 1000)
     url = in_memory(folder, f"resume-{left.decode().replace(' ', '-')}")
     entry = Manifest.load(url).shards[0]
@@ -190,7 +190,7 @@ def test_damaged_cache_is_mended(folder, cache, capsys):
 
 
 def test_altered_or_cut_shards_are_refused(folder, cache):
-    """A shard that is not what the manifest says is refused, and never gets into the cache."""
+    """A shard that differs from the manifest is refused, and is never stored in the cache."""
     url, files = in_memory(folder, "altered"), fsspec.filesystem("memory")
     first, second, *_ = Manifest.load(url).shards_of("train")
     content = (folder / first.name).read_bytes()
@@ -209,9 +209,8 @@ def test_altered_or_cut_shards_are_refused(folder, cache):
 
 @pytest.mark.parametrize("full", ["limit", "disk"])
 def test_full_cache(folder, cache, monkeypatch, full):
-    """A data set that is larger than the cache's limit, or its disk, is read all the same, again and again: shards that
-    were brought first make room. Nothing is thrown out for what is only fetched
-    ahead."""
+    """A data set larger than the cache's limit, or than its disk, can be read repeatedly: the oldest shards are
+    removed. Shards that are only fetched ahead remove none."""
     room = 30_000  # of 51,200 bytes in four shards
     if full == "limit":
         monkeypatch.setenv(LIMIT_VARIABLE, str(room / 1e9))
@@ -248,7 +247,7 @@ def test_full_cache(folder, cache, monkeypatch, full):
 
 
 def test_clock_that_was_set_back(folder, cache, monkeypatch):
-    """What was brought first makes room, also when this machine's clock stood in the future then."""
+    """The oldest shards are removed first, even if this machine's clock was in the future when they were fetched."""
     url = in_memory(folder, "clock")
     first, second, third, *_ = sorted(Manifest.load(url).shards, key=lambda shard: -shard.bytes)
     os.utime(brought(url, first), (2**33, 2**33))
@@ -297,7 +296,7 @@ def test_token(folder, serve, monkeypatch):
 
 
 def test_server_that_comes_back(folder, serve):
-    """A reader waits for a service that is started again, and meanwhile goes on with what it has."""
+    """A reader waits for a service that restarts, and meanwhile continues with its present episodes."""
     url = serve()
     store = EpisodeStore(url, "train")
     _ = store[0]
@@ -308,7 +307,7 @@ def test_server_that_comes_back(folder, serve):
 
 
 def test_command_without_its_server(monkeypatch, capsys):
-    """A command whose server stays away ends with one line that says what to do, and exit code 1."""
+    """If the server stays unreachable, the command ends with exit code 1 and one line with the remedy."""
     url = f"http://127.0.0.1:{free_port()}"
     assert exit_code(lambda _: Manifest.load(url, patience_s=0.01), "datagen", [], monkeypatch) == 1
     error = capsys.readouterr().err
@@ -364,8 +363,8 @@ FAULTS = [  # of the cache: a call that fails and its error, or what lies in the
 
 @pytest.mark.parametrize(("fault", "error", "message"), FAULTS)
 def test_a_cache_that_fails(folder, cache, monkeypatch, tmp_path, fault, error, message):
-    """What stands in the way is named and stays as it is, and what was fetched does not stay there; where it has no
-    locks, or cannot be made, another folder is asked for. Without the fault the shard comes."""
+    """The error names the obstacle in the cache, which stays unchanged, and fetched bytes do not remain there. If the
+    folder has no locks or cannot be created, the error asks for another folder. Without the fault the shard is read."""
     url, precious = in_memory(folder, "failing"), tmp_path / "precious"
     precious.write_text("mine")
     store = EpisodeStore(url, "train")
@@ -389,7 +388,7 @@ def test_a_cache_that_fails(folder, cache, monkeypatch, tmp_path, fault, error, 
 
 
 def test_damage_at_the_service(folder, serve):
-    """A reader that asks for a damaged shard is told so at once, and by whom."""
+    """A reader of a damaged shard immediately gets an error that names the service."""
     store = EpisodeStore(serve(), "train")
     shard = folder / store.manifest.shards[0].name
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")

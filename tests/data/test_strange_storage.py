@@ -82,8 +82,9 @@ class Shards(PlainFiles):
 @pytest.mark.parametrize("length", ["length", "chunked", "no size", "claimed", "length claimed"])
 @pytest.mark.parametrize("size", [5000, 50_000])
 def test_a_claim_that_its_server_denies_empties_no_cache(data, tmp_path, monkeypatch, ranges, length, size):
-    """A cache could make room for what an index claims, but the server's file is shorter or longer. Of 20 other files
-    no more are removed than the bytes that were written need, whatever size the server reports, or repeats."""
+    """The index claims a size that the cache could make space for, but the server's file is shorter or longer. The
+    cache removes no more of its 20 other files than the written bytes need, whatever size the server reports, or
+    repeats."""
     monkeypatch.setenv(LIMIT_VARIABLE, "0.000021")
     monkeypatch.setattr(storage, "_CHUNK_BYTES", 1000)
     monkeypatch.setattr(Shards, "end", ranges + length)
@@ -102,8 +103,8 @@ def test_a_claim_that_its_server_denies_empties_no_cache(data, tmp_path, monkeyp
 
 @pytest.mark.parametrize("dripping", ["manifest.json", ".tar", "head", "redirects"])
 def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
-    """A head or a body that comes more slowly than the least speed ends like one that does not come. All heads of a
-    chain of redirects have one deadline."""
+    """A head or a body that is slower than the least speed has the same result as no answer. All heads of a chain of
+    redirects have one deadline together."""
     monkeypatch.setenv(VARIABLE, "0")
 
     class Drip(PlainFiles):

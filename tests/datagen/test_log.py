@@ -9,8 +9,8 @@ from datagen.service.log import UnhurriedLog
 
 
 def test_who_writes_waits_for_nobody():
-    """What a reader takes comes in its order; where it stops reading lines are left out, which it is told later; when
-    it has gone nothing more comes, and nobody is held up."""
+    """A reader receives lines in order. If it stops reading, lines are dropped and a later line reports this. If it
+    closes the pipe, it receives nothing more. Writers never wait."""
     source, sink = os.pipe()
     with UnhurriedLog([sink]) as log:
         os.write(sink, b"first\n")

@@ -351,8 +351,8 @@ class StoppedWorker(LocalWorker):
 
 
 def test_stopped_solver_is_replaced(make_config, monkeypatch):
-    """A solver that has work and says nothing for too long (SIGSTOP, a device that hangs) is ended; one without work
-    is left alone, and so are all when the pool was stopped, too. Its scene is tried again by another."""
+    """A busy solver that sends nothing for too long (SIGSTOP, a device that hangs) is replaced, and another one
+    simulates its scene. Idle solvers are not replaced, and none is after the pool itself was stopped."""
     now, passes = [1000.0], iter([250, 250, 10_000, 250, 250, 250, 250])
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     solvers: list[StoppedWorker] = []

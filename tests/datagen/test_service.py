@@ -331,11 +331,8 @@ def test_what_cannot_be_served(monkeypatch, capsys, tmp_path, folder):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
-    """SIGTERM ends the service with 143, and its pool in order: no process stays behind, nothing is half-written. All
-    that beside a log that takes nothing, for nobody reads it.
-
-    `kill -9` is what test_kills.py is about.
-    """
+    """After SIGTERM the service ends with code 143 and stops its pool. No process remains, and no file is incomplete.
+    This holds even if nobody reads the log. test_kills.py tests `kill -9`."""
     (control / "slow").touch()
     arguments = ["out=made", "scenes=3", "dataset.validation_scenes=0", "dataset.test_scenes=0", "dataset.frames=5"]
     unread, log = os.pipe()

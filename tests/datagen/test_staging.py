@@ -78,8 +78,9 @@ def test_growth_keeps_what_is_there(make_config, make_dataset, tmp_path, control
 
 
 def test_what_is_complete(make_config, make_dataset, folder, stage, tmp_path):
-    """Asking again for what is there, or for less of it, changes no file, on whatever device, with whatever launches,
-    workers and shard size; a folder begun for five episodes and asked for one is complete when that one is there."""
+    """A command for existing episodes, or for fewer, changes no file, with any device, launch size, number of workers
+    and shard size. A folder that was started for five episodes is complete for a command for one, once this one
+    exists."""
     before = snapshot(folder)
     mpm = MpmConfig(device="cuda", scenes_per_launch=64)
     for config in (
@@ -169,8 +170,8 @@ def test_array_tasks_make_one_dataset(make_config, make_dataset, small_dataset, 
 
 @pytest.mark.parametrize("seconds", [0, 2**33])
 def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seconds):
-    """Machines whose clocks stand in 1970 or far in the future, beside others', make the same data set: no time of a
-    file says whether it is whole, left behind or new."""
+    """Machines with clocks in 1970 or far in the future make the same data set together with others. No time of a file
+    determines whether it is whole, abandoned or new."""
 
     def turn_back(folder):
         for path in (*folder.rglob("*"), folder):

@@ -103,9 +103,9 @@ def test_scenes(tmp_path, weights, small_pictures, monkeypatch):
 
 
 def test_what_may_surprise_is_said(tmp_path, weights, capsys):
-    """A network knows one water and one friction; a scene file's are the solver's, and a line says so. Others say which
-    of its meshes is no solid, which lies outside of the domain, in millimetres say, and which within a cell. The last
-    line says how to draw the file."""
+    """A network has learned one kind of water and one friction, and notes report other values in a scene file. Further
+    notes name meshes that are no solids, that are outside of the domain, for example in millimetres, or within one
+    cell. The last line explains how to draw the file."""
     (tmp_path / "open.obj").write_text("v 0.2 0.2 0.2\nv 0.4 0.2 0.2\nv 0.2 0.2 0.4\nf 1 2 3\n")
     obstacles = "{shape: square, size: 0.1, position: [0.8, 0.2, 0.5], friction: 0.2}, {mesh: open.obj}"
     obstacles += ", {mesh: open.obj, scale: 200, position: [500, 0, 0]}, {mesh: open.obj, scale: 0.01}"
@@ -124,7 +124,7 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
 
 
 def test_what_weights_do_not_support_is_refused_before_notes(tmp_path, weights, capsys):
-    """An elastic group for other weights: neither notes on the scene nor progress bars come before the error."""
+    """If weights do not support an elastic group, the error precedes notes on the scene and progress bars."""
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: elastic, youngs_modulus_pa: 1e5}"
     (tmp_path / "a.yaml").write_text(f"groups: [{group}]\nfloor_friction: 0.5\n")
     with pytest.raises(ConfigError, match="elastic"):

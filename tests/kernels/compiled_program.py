@@ -1,7 +1,9 @@
-"""What Triton makes of a small training's kernels for an H100, a line each: CANARY and what of Triton's interface held,
-COMPILED and a kernel of a grid with relative inputs, of a rollout, or the first of a name that starts early, EARLY,
-such a one, how often it waits, and its writes before, PRODUCT, kernel, tiles copied ahead and products under way
-meanwhile, HAZARDS, kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
+"""Compiles the kernels of a small training for an H100 and prints a line for each result: CANARY and the parts of
+Triton's interface that are as expected; COMPILED and a kernel of a grid with relative inputs, of a rollout, or the
+first with the name of a kernel that starts early; EARLY, such a kernel, the number of its waits, and the writes before
+them; PRODUCT, kernel, tiles copied ahead and products in progress meanwhile; HAZARDS, kernel, precision and their
+number; SHARED, kernel and its bytes of shared memory.
+"""
 
 import json
 import sys
@@ -50,7 +52,7 @@ make_ptx = CUDABackend.make_ptx
 
 
 def no_ptx(self, source, metadata, *_):
-    """Stands for make_ptx, a third of the time, where nobody looks at what it makes."""
+    """Replaces make_ptx, which takes a third of the time, if nobody reads its output."""
     metadata["name"] = "kernel"
     return ""
 

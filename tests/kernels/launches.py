@@ -1,6 +1,6 @@
-"""Every launch of a Triton kernel with what it was given and what it left, for the tests that judge each kernel alone.
+"""Records every launch of a Triton kernel with its arguments and results, for tests of single kernels.
 
-Launches are seen where Triton makes them: whatever launches a kernel, none is missed.
+The launches are intercepted in Triton, so that no caller is missed.
 """
 
 from contextlib import contextmanager

@@ -27,10 +27,8 @@ COMPUTED = {
 
 
 def evaluation(lines):
-    """A function that says a register's value in a thread, where shared memory begins at 0.
-
-    None where it is not always the same, or depends on more than the thread's number and what COMPUTED knows.
-    """
+    """Returns a function for a register's value in a thread, with shared memory at address 0. The function returns None
+    if the value varies, or depends on more than the thread's number and the registers in COMPUTED."""
     definitions = {}
     for line in lines:
         if match := re.match(r"(?:@\S+\s+)?[a-z][\w.:]*\s+(?:\{([^}]*)\}|(%\w+))", line):

@@ -1,9 +1,9 @@
-"""References of the kernels of the network in plain PyTorch. A reference has its kernel's name, takes the kernel's
-arguments by name, and returns what the kernel should leave in each buffer that it writes.
+"""Defines references of the network's kernels in plain PyTorch.
 
-A reference computes in the type of what it is given, float64 in the tests, and there of parameters not rounded.
-Gradients are those at the activations' signs that the kernel itself sees: of the hidden layer as it lies in memory, or
-where a kernel computes it again, of what it computes, rounded as it rounds.
+A reference has its kernel's name, takes the kernel's arguments by name, and returns the expected content of each buffer
+that the kernel writes. It computes in the type of its inputs, which is float64 in the tests, and there with parameters
+that are not rounded. Gradients use the signs of the activations that the kernel uses: those of the stored hidden layer,
+or of the layer that the kernel computes again, rounded as in the kernel.
 Shape legend: R rows, N particles, C cells, E edges, W width.
 """
 

@@ -93,9 +93,10 @@ def within(count=8):
 
 
 def test_ways_end_where_the_reference_ends_them():
-    """Scenes side by side, between walls: scattered obstacles, none, a gutter, where ends move along the crease, and a
-    ball. Ways of all lengths end where they do by PyTorch, to rounding, and pass no triangle; where nothing stops them
-    nothing changes, bitwise, nor of whatever has come apart. A table of a batch's barriers is that of each scene's."""
+    """Paths of several scenes between walls end where PyTorch's end, to rounding, and cross no triangle. The scenes
+    have scattered obstacles, none, a gutter, where paths end along the crease, a ball, and a slope. Paths that meet
+    nothing are bitwise unchanged, and so are particles that are not finite. A batch's table contains the tables of its
+    scenes."""
     corners, befores, afters = (list(x) for x in zip(met(0), met(1), *within(), strict=True))
     corners[1] = NO_CORNERS
     befores[1][0], afters[1][0] = (0.5, 0.3, 0.5), (0.5, 0.1, 0.5)

@@ -69,8 +69,9 @@ def test_too_many_are_refused(scene, message, monkeypatch):
 
 
 def test_first_room():
-    """Groups that fall have room to spread at once, up to what their particles can fill. With many cells there is
-    room for twice as many; with more, where memory counts, for a quarter more."""
+    """The first buffers have capacity for falling groups that spread, at most for the cells that their particles can
+    fill. With many cells the capacity is twice their number. With even more, where memory is limited, it is 1.25
+    times."""
     assert first_capacities((246, 53, 18, 5), 2_763) == (1_657, 276, 96, 40)
     assert first_capacities((1_398, 214, 56, 8), 4_296)[:2] == (2_796, 429)
     assert first_capacities((128_529, 23_263, 4_373, 612), 400_000) == (160_661, 32_768, 8_192, 1_224)

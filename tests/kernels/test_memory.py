@@ -68,9 +68,9 @@ def test_a_pass_without_room_stays_within_memory(training):
 
 @cpu_only
 def test_pushforward_stays_within_memory():
-    """Simulation after simulation, larger and smaller ones, scenes that are lost among them: every address that an
-    update is given holds a whole window (or all materials and obstacles) of a living tensor, and each simulation in the
-    same buffers launches what was captured, on the same memory."""
+    """After simulations of various sizes, some with lost scenes, every address in an update points to a whole window
+    (or all materials and obstacles) of an existing tensor. Simulations in the same buffers launch the captured programs
+    again, on the same memory."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
     training = training_of(precision="fp32", pushforward_frames=2, pushforward_fraction=0.9)

@@ -333,8 +333,8 @@ def on_meta():
 
 
 def test_growing_gives_back_first(monkeypatch):
-    """While buffers grow the old ones are gone; where there is no memory for larger ones, the simulation has its old
-    ones again and stands where it stood: with memory it goes on as if nothing had been."""
+    """Old buffers are freed before larger ones are allocated. Without memory for these, the simulation allocates the
+    old ones again and keeps its state. With memory it later continues as if nothing had happened."""
     expected = roomy_path()
     tight = TritonStepper(*spreading(), "fp32", (16,))
     old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
@@ -357,9 +357,8 @@ def test_growing_gives_back_first(monkeypatch):
 
 
 def test_frames_taken_away_beside_the_next(monkeypatch):
-    """Frames that are started before those before them are looked at are the same bitwise, where buffers grow too, and
-    equal those of a simulation that had room: what was started in vain moves nothing; and the frame of a divergence is
-    the same."""
+    """Frames that start before earlier ones are read are bitwise the same, also while buffers grow, and equal those of
+    a simulation with enough capacity. Frames started in vain change nothing. The frame of a divergence is the same."""
     monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 1)
     expected_TN3 = roomy_path()
     paths, growths, lost = [], [], []

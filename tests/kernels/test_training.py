@@ -139,8 +139,8 @@ def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys, 
 
 
 def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monkeypatch):
-    """A training that holds 6 of 14 episodes at a time, into its second epoch, gives the kernels the windows, rates and
-    weights of one that holds all, bitwise, and each episode comes once an epoch."""
+    """A training with 6 of 14 episodes in memory at a time computes, into its second epoch, bitwise the same windows,
+    rates and weights as one with all of them. Each episode is used once an epoch."""
     config = make_config(training_scenes=14, validation_scenes=1, test_scenes=0, frames=3)
     make_dataset(config)
     monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)  # in float32

@@ -37,8 +37,8 @@ def test_the_interface_is_as_it_was(lines):
 
 @pytest.mark.slow
 def test_what_the_interpreter_forgives(lines):
-    """All kernels of grids and relative inputs compile, of an update and of a frame, held by walls and obstacles or by
-    nothing: the interpreter takes what Triton does not, a constant that is defined twice say."""
+    """All kernels of grids and relative inputs, of an update, and of a frame with and without walls and obstacles
+    compile. The interpreter accepts code that Triton refuses, for example a constant that is defined twice."""
     compiled = [line[1] for line in lines if line[0] == "COMPILED"]
     names = {"sum_motion", "prepare_relative_features", "sum_coarsest", "balance", "balance_backward", "add_coarsest"}
     assert set(compiled) > names and len(compiled) > len(set(compiled)), compiled
@@ -67,8 +67,8 @@ def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines):
 
 @pytest.mark.slow
 def test_no_group_overwrites_what_another_still_multiplies(lines):
-    """Kernels of eight warps have a barrier between a product and the next write to what a product reads, for the wait
-    for products of Triton 3.6 to 3.8 holds four warps alone."""
+    """Kernels of eight warps have a barrier between a product and the next write to its operands, because the wait for
+    products of Triton 3.6 to 3.8 covers only four warps."""
     scanned = [line[1:] for line in lines if line[0] == "HAZARDS"]
     assert {kernel for kernel, _, _ in scanned} >= {
         "weight_gradient",

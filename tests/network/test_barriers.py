@@ -146,8 +146,8 @@ def test_fine_bowls_do_not_stop_what_slides(speed, kept):
 
 
 def test_narrow_channels_hold_what_is_in_them():
-    """Between sheets nearer to each other than the clearance there is no room: nothing comes through them, and a way
-    across them ends where it meets one."""
+    """Sheets may be closer together than the clearance. No particle between them passes, and a path across them ends at
+    the first sheet."""
     sheets = np.concatenate([square((0.5, 0.5 + offset * CLEARANCE, 0.5), 1) for offset in (0, 0.8)])
     position_13, velocity_13 = ended((0.5, 0.5 + 0.4 * CLEARANCE, 0.5), (0.51, 0.45, 0.5), barriers_of(sheets))
     assert 0.5 < position_13[0, 1] < 0.5 + 0.8 * CLEARANCE and abs(velocity_13[0, 1]) < CLEARANCE
@@ -176,7 +176,8 @@ def test_no_triangle_is_passed(dtype, walls):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_slope_stops_a_way_once(dtype):
-    """What a turned square stops slides along it, whatever rounding does: nothing that has room stays where it was."""
+    """A path that meets a rotated square slides along it, whatever the rounding. A path with free space ahead never
+    ends at its start."""
     generator = np.random.default_rng(3)
     turn_33 = euler_rotation((20, 40, 70))
     corner_F33 = (square((0.0,) * 3, 1, 0.6) @ turn_33.T + 0.5).astype(np.float32)

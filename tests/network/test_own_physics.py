@@ -67,8 +67,8 @@ def mean_push(network, state):
 
 
 def test_training_begins_with_zero_columns_that_change_no_bit():
-    """A network that begins with shipped weights computes what they do, in float32: without friction and parameters,
-    with parameters alone, and with friction of 0, which skips nothing."""
+    """A network initialised with shipped weights computes the same as these in float32: without friction and
+    parameters, with parameters only, and with friction 0, which is still computed."""
     network, state = load_weights(find_weights("mechanics"))[0], random_state((40, 17), dtype=torch.float32)
     training = TrainingConfig(init_weights="mechanics")
     config = TrainConfig(network=replace(network.config, own_physics=OWN), step=network.step, training=training)

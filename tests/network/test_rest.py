@@ -73,9 +73,9 @@ def test_nothing_changes_in_flight(threshold):
 
 @pytest.mark.parametrize("shift", [0.0, 0.05, 0.12])  # over a face of cells of 0.14, too
 def test_a_pile_comes_to_rest(shift):
-    """Under random pushes below the threshold a body of half a coarsest cell, wherever it lies, never deforms faster
-    than by two of them, and without any it comes to rest; without rest deformation grows and stays. What moves as one
-    rigid body goes on so, as on a slope, and what deforms faster than 1.5 of the threshold is left alone."""
+    """Under random pushes below the threshold a body of half a coarsest cell never deforms faster than by two pushes,
+    at any place. Without pushes it comes to rest. Without the constraint the deformation grows and stays. Rigid motion
+    is unchanged, and so is a deformation faster than 1.5 times the threshold."""
     place_N3 = within_a_cell() * 0.7 + shift
     state, grid, touched_C = on_cells(place_N3)
     rate_13 = torch.tensor([[9.0, 3.0, 5.0]]).double()

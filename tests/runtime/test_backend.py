@@ -144,7 +144,8 @@ def test_what_is_missing(host, monkeypatch):
 
 
 def test_it_is_said(host):
-    """Backend torch runs instead, and says why; who asks for triton is told what to install."""
+    """If backend triton is not available, backend torch runs and prints the reason. An explicit backend=triton raises
+    an error with the package to install."""
     network = build_network(NetworkConfig(width=16))
     chosen = choose(GPU, network)
     assert chosen.name == "torch" and "Python.h" in chosen.note

@@ -1,4 +1,4 @@
-"""A step as ONNX and as a compiled package: what other programs run is what this one computes."""
+"""Tests a step as ONNX and as a compiled package: other programs compute the same as this one."""
 
 import json
 import os
@@ -169,8 +169,8 @@ def test_operators_of_torchvision_are_not_missed(caplog):
 
 
 def test_onnx_is_the_step(as_onnx):
-    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles, which hold some of
-    them; the file says what its weights say of themselves; the example in Python simulates a scene's arrays."""
+    """ONNX Runtime computes the step to 1e-6 for any number of particles, with and without obstacles, some of which
+    stop particles. The file contains the weights' metadata. The example in Python simulates a scene's arrays."""
     import onnxruntime
 
     network, folder = as_onnx

@@ -46,7 +46,7 @@ print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
 
 
 def test_public_names():
-    """What the package offers by name is what its modules have, told to type checkers too; another name is refused."""
+    """The package's public names are those of its modules, also for type checkers. Another name is refused."""
     text = Path(hgn.__file__).read_text()
     for name in hgn.__all__:
         value = getattr(hgn, name)
@@ -56,9 +56,9 @@ def test_public_names():
 
 
 def test_simulating_loads_no_training_stack(tmp_path):
-    """Loading weights and simulating a scene file with a mesh, by the API and by hgn.rollout, imports none of
-    Lightning, Hydra, Taichi, WebDataset, TensorBoard, no package of any extra, nor the project's own training, data and
-    generator, nor what only other jobs need."""
+    """Loading weights and simulating a scene file with a mesh, by the API and by hgn.rollout, imports no Lightning,
+    Hydra, Taichi, WebDataset or TensorBoard, no package of an extra, and no module of training, data, the generator or
+    other commands."""
     network = network_of(torch.float32)
     weights = tmp_path / "weights.safetensors"
     save_weights(weights, network, WeightsInfo(network.config, 60.0, 1 / 64))

@@ -1,4 +1,4 @@
-"""Scenes that change while they are simulated: what stays must stay to the bit, what changes must be what was asked."""
+"""Tests changes of scenes during a simulation: unchanged values stay bitwise, and changes have the requested effect."""
 
 from dataclasses import replace
 
@@ -182,8 +182,8 @@ def test_gravity_changes_between_frames():
 
 
 def test_what_is_refused_changes_nothing():
-    """Materials and gravity that the weights do not know, and arrays that do not fit, are refused by name; the
-    simulation goes on as if nothing had been asked."""
+    """Unsupported materials and gravity, and arrays that do not fit, are refused by name. The simulation then continues
+    unchanged."""
     network = small(materials=("water", "sand"))
     info = WeightsInfo(network.config, 60.0, 1 / 64)
     simulator, first = Simulator(network, 60.0, info=info), scene(20)

@@ -1,4 +1,4 @@
-"""Many live scenes in one batch: each moves as it does alone, whatever is done to the others."""
+"""Tests many live scenes in one batch: each moves as if alone, whatever changes in the others."""
 
 from dataclasses import replace
 

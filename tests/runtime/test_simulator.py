@@ -71,9 +71,9 @@ def test_history_at_the_start_is_ballistic():
 
 @pytest.mark.parametrize("gravity", [GRAVITY, (0.0, 0.0, 0.0), (9.8, 0.0, -3.0), (0.0, 19.6, 0.0)])
 def test_free_flight_is_the_closed_form(tmp_path, gravity):
-    """Weights of relative inputs that add nothing to gravity fly a scene along x0 + v0 t + g t^2 / 2, whatever its own,
-    in a batch with another's, and the history that they begin with shows none of it; absolute ones that predict gravity
-    do so too."""
+    """Weights with relative inputs that add nothing to gravity move a scene along x0 + v0 t + g t^2 / 2, for any
+    gravity, also in a batch with another one, and the initial history does not matter. Absolute weights that predict
+    gravity do so too."""
     network = silent(network_of(torch.float32, inputs="relative"))
     simulator = loaded(tmp_path, network)
     scenes = [initial(9), initial(25, gravity=gravity)]
@@ -133,7 +133,7 @@ def test_scene_file_to_rollout(tmp_path):
 
 
 def test_frame_by_frame(tmp_path):
-    """Frames asked for one by one are those of a rollout, beside another scene's; a Scene is taken as it is."""
+    """Single frames equal those of a rollout, also with another scene in the batch. A Scene is accepted directly."""
     simulator = loaded(tmp_path, network_of(torch.float32))
     assert simulator.frame_rate_hz == 60.0 and simulator.backend.note.startswith(
         "runtime backend: cpu (not triton: it needs a CUDA device, not cpu), precision fp32, rows "

@@ -1,4 +1,4 @@
-"""Walls that nothing passes (`step.wall_clearance`): what is held, what is free, and what has still come apart."""
+"""Tests walls (`step.wall_clearance`): which positions are constrained, which are not, and which still diverge."""
 
 from functools import partial
 
@@ -48,8 +48,8 @@ FRAMES = [  # place, velocity, acceleration and the domain's size on one axis; p
 
 @pytest.mark.parametrize(("axis", "dimensions"), [(0, 3), (1, 3), (2, 3), (1, 2), (2, 2)])
 def test_a_frame_at_a_wall(axis, dimensions):
-    """Positions go no nearer to a plane than the clearance, or than they were; the velocity is what was moved. In two
-    dimensions z has no walls. The other axes, in the domain's middle, are left alone."""
+    """A position does not come closer to a plane than the clearance, or than before. The velocity is the displacement.
+    In two dimensions z has no walls. The other axes, in the domain's middle, stay unchanged."""
     x_N, v_N, a_N, size_N, end_N, left_N = torch.tensor(FRAMES, dtype=torch.float64).T
     count, others = len(x_N), [i for i in range(3) if i != axis]
     position_N3, velocity_NM3 = torch.full((count, 3), 0.5).double(), torch.zeros(count, 5, 3).double()

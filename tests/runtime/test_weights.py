@@ -1,4 +1,4 @@
-"""Inference weights: what comes out is what went in, and every file that is not ours is refused."""
+"""Tests inference weights: loading inverts saving, and files of other programs are refused."""
 
 import json
 import math
@@ -45,8 +45,8 @@ def rewrite(path, change, structure=None):
 
 
 def test_exported_checkpoint_is_the_trained_network(finished_once, tmp_path):
-    """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
-    remembers what it was trained on."""
+    """A checkpoint of the trainer, exported and loaded, predicts the same as the checkpoint's network (to 1e-6), and
+    contains the properties of its data."""
     checkpoint, path = finished_once[1] / "checkpoints" / "last.ckpt", tmp_path / "shipped" / "weights.safetensors"
     export(checkpoint, path)
     loaded, info = load_weights(path)
@@ -212,7 +212,7 @@ def test_numbers_that_are_not_finite_are_not_written(weights):
 
 
 def test_failed_save_leaves_the_old_file(weights, monkeypatch):
-    """A full disk while writing leaves the earlier file, whole, and nothing beside it."""
+    """If the disk is full during a write, the earlier file stays whole, and no other file remains."""
     network, info = load_weights(weights)
     before = weights.read_bytes()
 

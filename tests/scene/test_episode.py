@@ -1,4 +1,4 @@
-"""The episode codec: nothing is lost, the same input gives the same bytes, and every fault is named."""
+"""Tests the episode codec: it loses nothing, equal input gives equal bytes, and errors name each fault."""
 
 import dataclasses
 import io
@@ -126,7 +126,7 @@ def test_frames_are_not_checked_one_by_one(monkeypatch):
 
 @pytest.mark.parametrize("frames_per_block", [1, 2, 3, 4])
 def test_positions_that_are_not_finite_are_refused_both_ways(monkeypatch, frames_per_block):
-    """Neither writing nor reading lets a NaN through, and the message names frame and particle."""
+    """Writing and reading both refuse NaN, and the message names frame and particle."""
     episode = make_episode()
     monkeypatch.setattr(episode_module, "_BLOCK_PARTICLES", frames_per_block * episode.particle_count)
     position = episode.position_TN3.copy()

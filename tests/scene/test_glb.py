@@ -121,7 +121,7 @@ def test_invisible_nodes(tmp_path, visible, shown, required):
 
 @pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint16])
 def test_quantised_positions(tmp_path, dtype):
-    """Integers that stand for fractions, and integers that are what they are."""
+    """Normalised integers become fractions, and other integers keep their values."""
     file = Glb()
     largest = np.iinfo(dtype).max
     padded = np.zeros((8, 4), dtype)

@@ -197,7 +197,7 @@ def test_archives_that_torch_reads_otherwise(tmp_path, change, message):
 
 
 def test_lists_that_are_too_long(monkeypatch):
-    """A message says what counts: the items of a long list, and those of references."""
+    """The message states what is counted: the items of a long list, or those of references."""
     monkeypatch.setattr(claims, "MOST_ITEMS", 9)
     shared = (1, 2, 3)
     for value in (list(range(12)), [shared] * 4):
@@ -359,8 +359,7 @@ def test_a_disk_that_fails(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", FILES)
 def test_decoders_bear_any_bytes(kind, request):
-    """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out, and
-    that in no more than 0.5 GB of memory."""
+    """A file with some bytes changed, cut or repeated is read, or refused with a message, within 0.5 GB of memory."""
     name, content, decode = FILES[kind]
     places = st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=4)
     soak = request.config.getoption("soak")

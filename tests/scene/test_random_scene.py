@@ -284,7 +284,8 @@ def test_wide_and_empty_scenes():
     ],
 )
 def test_what_does_not_fit_is_named(changes, message):
-    """Too many or too large items end in an error that says which and what to change; so do bad seeds."""
+    """Too many or too large items raise an error that names the item and the setting to change. Bad seeds raise one
+    too."""
     values = {"obstacle_count": 0, "seed": 0} | changes
     seed = values.pop("seed")
     with pytest.raises(ConfigError, match=message):

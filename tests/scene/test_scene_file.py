@@ -382,7 +382,7 @@ def test_material_parameters_of_groups(tmp_path):
 
 @pytest.mark.parametrize(("text", "value"), [("1e5", 1e5), ("1.0e5", 1e5), ("+2E-1", 0.2), (".5e1", 5.0), ("3", 3.0)])
 def test_numbers_as_people_write_them(tmp_path, text, value):
-    """A power of ten needs neither a point nor a sign."""
+    """A power of ten needs neither a decimal point nor a sign."""
     group = f"{{shape: cube, size: 0.08, position: [0.5, 0.5, 0.5], material: water, density_kg_m3: {text}}}"
     scene = load_scene(write(tmp_path, f"groups: [{group}]"))
     np.testing.assert_array_equal(np.unique(scene.material_parameters["density_kg_m3"]), np.float32(value))

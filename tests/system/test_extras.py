@@ -1,4 +1,4 @@
-"""Extras: a command that lacks a package says which extra brings it."""
+"""Tests extras: if a package is missing, the error names the extra that installs it."""
 
 import importlib
 import json

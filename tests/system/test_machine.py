@@ -64,7 +64,7 @@ def test_limits(root, files, cpus, gib):
 
 
 def test_this_machine():
-    """What it tells is at least one core, and no more than it has."""
+    """The number of cores is at least one, and at most the number of this machine."""
     assert 1 <= available_cpus() <= (os.cpu_count() or 1)
     assert 0 < available_memory() <= os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
@@ -86,8 +86,8 @@ def test_threads_keep_to_a_quota(monkeypatch):
 
 
 def test_folders_that_can_be_written_to(tmp_path, monkeypatch):
-    """The usual one, there or not yet, and nothing is made. Else this user's own, the same one each time, which nobody
-    else reads; and not a link that stands in its place."""
+    """The result is the usual folder, whether it exists or not, and nothing is created. If it is not writable, the
+    result is a private folder of this user, the same one each time, and never a link in its place."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
     (tmp_path / "file").touch()

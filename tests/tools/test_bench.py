@@ -162,7 +162,7 @@ def test_workloads():
 
 
 def test_json_option(tmp_path):
-    """The command takes --json FILE as other tools do, beside overrides; without a name it says so."""
+    """The command accepts --json FILE like other tools, together with overrides. Without a name it raises an error."""
     path = tmp_path / "bench.json"
     small = ["cases=[frame]", "particles=[30]", "seconds=1e-9", "network.width=8", "network.levels=1", "device=cpu"]
     assert run_module("tools.bench", ["--json", str(path), *small]) == 0

@@ -87,8 +87,9 @@ def test_one_step_errors_by_kind_of_scene(episodes, episode, capsys):
 
 
 def test_one_step_errors_of_triton(episode):
-    """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
-    network's, whatever its walls hold; what is captured serves the next frames, and those of fewer particles too."""
+    """One-step errors of backend triton are computed by its kernels, for several frames together. In float32 they equal
+    those of the plain network, whatever its walls constrain. Captured programs are used again for further frames, and
+    for fewer particles."""
     more, fewer = some_of(episode, slice(0, 12)), some_of(episode, slice(1, 12))
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, wall_clearance=(0.5, 0.5))
     backend, made = build("triton", network, "fp32"), []
@@ -160,7 +161,7 @@ def test_shares_inside_obstacles_and_outside_of_the_domain():
 
 
 def test_frames_that_end_together():
-    """The clock counts from the end of the first bunch of frames; with one bunch only it tells nothing."""
+    """The clock measures from the end of the first group of frames. With a single group it returns no time."""
     clock = FrameClock()
     clock.ends = [1.0, 1.000001, 1.000002, 1.3, 1.300001, 1.300002]
     assert clock.milliseconds() == pytest.approx(100, rel=1e-3)

@@ -1,4 +1,4 @@
-"""python -m tools.render: which files it writes, and what it says of input that does not fit."""
+"""Tests python -m tools.render: its files, and its messages for input that does not fit."""
 
 import dataclasses
 from pathlib import Path
@@ -33,7 +33,7 @@ def names_in(folder):
 
 @pytest.mark.parametrize("ending", ["png", "gif", "webp"])
 def test_single_file(tmp_path, ending):
-    """A file name as `out` gets that picture alone, with the frames asked for."""
+    """If `out` is the name of a file, only this picture is drawn, with the requested frames."""
     out = tmp_path / f"one.{ending}"
     main({"rollout": str(rollout_file(tmp_path, True)), "out": str(out), "size": 80, "frames": [0, 8], "every": 4})
     assert names_in(tmp_path) == {"fall.vtkhdf", out.name}

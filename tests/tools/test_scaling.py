@@ -45,7 +45,8 @@ def test_rows_of_every_case(warm_python, tmp_path):
 
 
 def test_scenes_are_balanced():
-    """Ranks have scenes of as many particles at each update, and the same scenes on as many ranks as when measured."""
+    """All ranks have nearly equal numbers of particles in each update. The scenes that a rank trains on are those of
+    its row."""
     config = from_mapping(ScalingConfig, {"batches": 20})
     counts_BRS = measure._particles(config, 4, 0.17)
     load_BR = counts_BRS.sum(-1)

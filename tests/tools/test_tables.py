@@ -155,7 +155,7 @@ def test_safetensors_header(tmp_path):
 
 
 def test_pages_elsewhere(tmp_path):
-    """A specification may name the pages that it writes; others beside it are left alone."""
+    """A specification may name the pages that it writes. Other pages in their folder stay unchanged."""
     specification = folder(tmp_path, "pages: [../../READ.md]\n" + SPECIFICATION, "<!--=unknown-->1<!--/-->")
     (tmp_path / "READ.md").write_text(PAGE)
     (page,) = pages(specification)

@@ -1,14 +1,14 @@
-"""One rank of a distributed training: python ddp_program.py FOLDER, started by torchrun or Lightning's own launcher.
+"""Runs one rank of a distributed training: python ddp_program.py FOLDER, started by torchrun or Lightning's launcher.
 
-Trains as FOLDER/mapping.json says. FOLDER/faults.json holds [restart, rank, update, fault, target] rows: in that start,
-that rank sends a signal (its number) at that update to itself (target self) or to torchrun (launcher), meets an error
-of its own ("error"), misses its data ("storage"), or gets other weights ("weights"). FOLDER/stopped_RANK is the process
-that a SIGSTOP stops. FOLDER/watch.json, where it is, has constants of hgn.training.watch.
-Ranks exchange stop requests at every tenth update, or as FOLDER/clock.json says, the seconds from one look of a rank's
-stopper at its clock to the next.
-Keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update, FOLDER/end_RANK.pt with the weights, the update
-and the exit code, FOLDER/starts_RANK with the update of each start, FOLDER/talk_RANK.json with the updates at which
-ranks talked of anything but gradients, FOLDER/recorder_RANK.json with the flight recorder's variables as ranks met.
+FOLDER/mapping.json contains the settings. FOLDER/faults.json contains rows [restart, rank, update, fault, target]: in
+this start the rank sends a signal (its number) at this update to itself (target self) or to torchrun (launcher), raises
+an error ("error"), lacks its data ("storage"), or gets other weights ("weights"). FOLDER/stopped_RANK is the process
+that SIGSTOP stops. The optional FOLDER/watch.json contains constants of hgn.training.watch. Ranks exchange stop
+requests at every tenth update, or as in FOLDER/clock.json, which contains the seconds between two times that a rank's
+stopper reads. The program writes FOLDER/gradients_RANK.pt of the first update; FOLDER/end_RANK.pt with the weights, the
+update and the exit code; FOLDER/starts_RANK with the update of each start; FOLDER/talk_RANK.json with the updates at
+which ranks exchanged anything but gradients; and FOLDER/recorder_RANK.json with the flight recorder's variables when
+the ranks met.
 """
 
 import json

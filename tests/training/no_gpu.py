@@ -6,7 +6,7 @@ from hgn.kernels.triton_compat import use_target
 
 
 class NoGpu:
-    """What of a driver compiling asks for."""
+    """Replaces the parts of a driver that compilation uses."""
 
     @staticmethod
     def launcher_cls(source, metadata): ...

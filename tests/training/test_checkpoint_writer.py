@@ -1,4 +1,4 @@
-"""Checkpoints written beside the training: what they hold, and what becomes of them when something goes wrong."""
+"""Tests checkpoints that are written during updates: their content, and the handling of faults."""
 
 import signal
 import threading
@@ -24,7 +24,7 @@ def writer():
 
 
 class Gate:
-    """Holds up every write until it is opened, and remembers what happened."""
+    """Blocks every write until it is opened, and records the events."""
 
     def __init__(self, monkeypatch):
         self.opened = threading.Event()
@@ -67,7 +67,7 @@ def test_shared_memory_is_stored_once(writer, tmp_path):
 
 
 def test_one_write_at_a_time(writer, tmp_path, monkeypatch):
-    """The next write waits for the one under way; neither is lost."""
+    """The next write waits for the present one, and both files are written."""
     gate = Gate(monkeypatch)
     writer.save_checkpoint({"value": 1}, tmp_path / "first.ckpt")
     second = threading.Thread(target=writer.save_checkpoint, args=({"value": 2}, tmp_path / "second.ckpt"))

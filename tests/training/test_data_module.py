@@ -99,9 +99,9 @@ def test_ranks_with_other_data_are_refused(folder, here):
 
 @pytest.mark.parametrize(("ahead", "room"), [(False, 1 / 3), (True, 1 / 3), (True, 2 / 3)])
 def test_data_larger_than_the_cache(make_config, make_dataset, cache, monkeypatch, ahead, room):
-    """Shuffled in windows, an epoch fetches each shard once through a cache with room for a third of the data, and its
-    batches are those of a reader that has all of it. With room for two windows no shard is waited for but the first
-    window's: the order says what is needed next."""
+    """With shuffling in windows, an epoch fetches each shard once through a cache for a third of the data. Its batches
+    equal those of a reader with all data. If the cache has space for two windows, the training waits only for shards of
+    the first one, because the next samples are known in advance."""
     folder = make_dataset(make_config(training_scenes=32, validation_scenes=0, test_scenes=0, frames=3))
     training = replace(SETTINGS[1], shuffle_episodes=8)
     sizes = [shard.bytes for shard in EpisodeStore(folder, "train").manifest.shards]

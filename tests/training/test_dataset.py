@@ -134,8 +134,8 @@ def other(make_config, make_dataset, tmp_path):
 
 
 def test_more_data(data, other, run):
-    """A run on two data sets has the episodes and the statistics of both, and goes on with both; without the second it
-    is not gone on with in the middle of an epoch."""
+    """A run on two data sets has the episodes and the statistics of both, and resumes with both. Without the second set
+    it does not resume within an epoch."""
     more = {"more_data": [other.dataset.folder], "minimum_episodes": 8}
     assert train.main(train_mapping(data, run, **more, maximum_updates=6)) == 0
     assert {record["episodes"] for record in metrics(run) if "loss" in record} == {8}

@@ -56,7 +56,7 @@ def torchrun(folder, *options, python, prefix=(), **variables):
 
 
 def output(process):
-    """What it printed until it ended; nothing may hang."""
+    """Returns the output of a process up to its end, which must come in time."""
     try:
         return process.communicate(timeout=PATIENCE_S)[0]
     except subprocess.TimeoutExpired:
@@ -84,9 +84,9 @@ class Reference:
         return path
 
     def check(self, folder, exit_code):
-        """The gradients of both ranks are those of one with both scenes, to 1e-6; both ended at update 20 with equal
-        weights, the checkpoint's, and one run folder. Where nothing is logged (every 4 updates), saved (5) or agreed on
-        (10), and no epoch begins, gradients alone travelled. Returns the weights."""
+        """Checks that the gradients of both ranks equal those of one rank with both scenes, to 1e-6, and that both
+        ended at update 20 with the checkpoint's parameters and one run folder. In updates without log (every 4),
+        checkpoint (5), agreement (10) or new epoch, ranks exchange only gradients. Returns the parameters."""
         gradients = [load(folder / f"gradients_{rank}.pt") for rank in (0, 1)]
         assert gradients[0].keys() == gradients[1].keys() == self.gradients.keys()
         for name, expected in self.gradients.items():

@@ -41,9 +41,9 @@ def wait(generator):
 
 
 def test_makes_what_is_missing(tmp_path):
-    """It asks for the first episodes early, says how many frames are done, goes on after a stop, and completes the data
-    set; where the folder holds another one, `check` gives the generator's own message and names its log.
-    """
+    """The generator makes the first episodes early, reports the number of finished frames, continues after a stop, and
+    completes the data set. If the folder contains another data set, `check` raises the generator's message and names
+    its log."""
     config = small_config(tmp_path / "data")
     generator = Generator(config, tmp_path / "run")
     assert yaml.safe_load((tmp_path / "run/dataset.yaml").read_text())["progress"] == "json"  # few scenes first

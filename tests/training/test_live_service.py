@@ -57,8 +57,8 @@ def service(control, cache, tmp_path, monkeypatch):
 
 
 def test_service_restarted_midway(make_config, service, control, tmp_path, monkeypatch):
-    """A trainer reads over HTTP what a service makes meanwhile. The service is killed with all its processes and
-    started again: training goes on through it, with the scenes it has and then with those that come."""
+    """A trainer reads a growing data set over HTTP. The service is killed with all its processes and restarted. The
+    training continues meanwhile with its present scenes, and then with new ones."""
     config = make_config(folder=service.url, training_scenes=SCENES, validation_scenes=1, test_scenes=0)
     run = tmp_path / "run"
     seen: dict[str, int] = {}
@@ -104,8 +104,8 @@ def test_service_restarted_midway(make_config, service, control, tmp_path, monke
 
 
 def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, cache, monkeypatch):
-    """SIGTERM that finds a training waiting for a server that is gone ends it at once, after a checkpoint of all that
-    was trained on; the same command goes on there."""
+    """SIGTERM during a wait for an absent server ends the training immediately, after a checkpoint of all updates. The
+    same command continues from it."""
     monkeypatch.setattr(hgn.training.data_module, "LOOK_S", 0.05)
     make_dataset(make_config())
     files = fsspec.filesystem("memory")

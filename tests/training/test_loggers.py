@@ -1,6 +1,5 @@
-"""Loggers of a training: what reaches them, which run a resumed training continues, and that their faults end nothing.
-
-A stand-in with Lightning's interface takes the place of W&B and MLflow; where those are installed, they are tried too.
+"""Tests the loggers of a training: their records, the run that a resumed training continues, and that their faults end
+nothing. A class with Lightning's interface replaces W&B and MLflow; if these are installed, they are tested too.
 """
 
 import functools

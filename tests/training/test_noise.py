@@ -51,8 +51,9 @@ def test_walk_has_the_papers_spread():
 
 
 def test_correlated_noise():
-    """The waves' share of the variance is asked for; what is left of it are the particles' own walks. Neighbours have
-    the waves in common, particles far apart do not, nor do other scenes; no share is bitwise the noise without."""
+    """The waves have the configured fraction of the variance, and the particles' independent walks have the rest.
+    Neighbours share the waves. Distant particles and other scenes do not. With fraction 0 the noise is bitwise the
+    uncorrelated one."""
     still = np.random.default_rng(3).uniform(0.1, 0.9, (1, 4_000, 3)).astype(np.float32)
     scene = replace(episode(4_000), position_TN3=np.repeat(still, 12, 0))
     cell_size = 0.035
@@ -135,8 +136,8 @@ def test_what_is_asked_for():
 
 
 def test_what_rests_counts_more():
-    """Below `quiet_acceleration` a sample counts as often as its acceleration is smaller, up to `quiet_weight`; by
-    default all count alike."""
+    """Below `quiet_acceleration` the loss weight of a sample is the ratio of this value to its acceleration, at most
+    QUIET_WEIGHT. By default all weights are 1."""
     quiet = TrainingConfig(quiet_acceleration=1e-3)
     asked = (1.0, 1e-3, 5e-4, 1e-4, 1e-6, 0.0)
     assert [quiet_weight(quiet, acceleration) for acceleration in asked] == pytest.approx([1, 1, 2, 4, 4, 4])

@@ -54,8 +54,8 @@ def test_processes_compile_the_kernels_of_the_training(experiment, monkeypatch):
     ],
 )
 def test_what_is_told(program, interrupted, expected):
-    """What was compiled is counted; when a process fails, its exit code and last line are told, and that nothing is
-    lost; whoever is interrupted waits no longer, and no process is left."""
+    """The message counts the compiled kernels. If a process fails, it contains the exit code and the last line, and
+    states that missing kernels are compiled later. An interruption ends the wait, and no process remains."""
     ahead = Precompilation(job(), (9, 0), False, 2, (sys.executable, "-c", f"import sys; {program}"))
     try:
         assert re.search(expected, ahead.wait(lambda: interrupted)) and not ahead.running

@@ -146,9 +146,10 @@ def test_feeds_of_all_ranks_resume_anywhere(data):
 
 
 def test_resume_equals_no_interruption(data, tmp_path, monkeypatch):
-    """Interrupted at any updates at which a pushforward pool is made anew, a training ends where an uninterrupted one
-    does, bit by bit: weights, their average, both moments, learning rate and order; noise, jitter and symmetries come
-    from the samples' seeds, so they agree too. Interrupted elsewhere it goes on with a pool of its own."""
+    """A training that is interrupted at updates with a new pushforward pool ends bitwise as an uninterrupted one:
+    parameters, their average, both moments, learning rate and order of samples. Noise, jitter and symmetries depend on
+    the samples' seeds, so they agree too. After an interruption at another update the training continues with a
+    different pool."""
     place: dict[str, Any] = {}
     step = TrainingModule.training_step
     monkeypatch.setattr(TrainingModule, "training_step", lambda m, chunk: place.update(module=m) or step(m, chunk))

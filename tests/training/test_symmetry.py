@@ -118,7 +118,8 @@ def test_a_particle_on_a_face_takes_the_cell_above_in_the_image():
 
 
 def test_symmetries_belong_to_samples_and_data_stay():
-    """What a sample is shown as depends on its seed alone, and the identity, as none, changes no bit."""
+    """The symmetry of a sample depends only on its seed. The identity and the setting `none` change no bit of the
+    data."""
     episodes = [scene_with_obstacles(i) for i in range(3)]
     config = network_of().config
     together = make_batch([(e, 6) for e in episodes], config, (7, 8, 9))

@@ -227,7 +227,8 @@ def test_the_best_network_is_remembered(data, run, monkeypatch):
 
 
 def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, tmp_path, capsys):
-    """The start says so, the end says what to export instead, and so does an export of the one that is not there."""
+    """Without validation scenes the start prints that there is no best checkpoint. The end, and an export of the
+    missing file, name the checkpoint to export instead."""
     config, run = make_config(validation_scenes=0), tmp_path / "run"
     make_dataset(config)
     assert train.main(train_mapping(config, run, maximum_updates=2)) == 0
@@ -296,8 +297,8 @@ def test_damaged_checkpoints_are_refused(finished, capsys):
 
 @pytest.mark.parametrize("order", list(permutations((signal.SIGTERM, signal.SIGUSR1))))
 def test_signals_of_a_scheduler(order, capfd, monkeypatch):
-    """SIGUSR1, by which a job is queued again, counts, whatever comes before or after it. The first rank says once that
-    the training ends."""
+    """SIGUSR1, which requeues a job, determines the exit code, whatever signals come before or after it. The first rank
+    prints once that the training ends."""
     for rank, lines in (("0", 1), ("1", 0)):
         monkeypatch.setenv("RANK", rank)
         stop = StopRequest()

@@ -128,8 +128,8 @@ def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks, tmp_p
 
 @pytest.mark.parametrize("stuck", [True, False])
 def test_a_rank_that_waits_for_one_that_ended_ends(monkeypatch, ranks, tmp_path, stuck):
-    """As NCCL's collectives do, which report no lost connection; also if a file is read while it is written. One that
-    still makes updates goes on."""
+    """A rank ends if it waits for one that ended, although NCCL's collectives report no lost connection, and also if
+    the count is read while it is written. A rank that still makes updates continues."""
     monkeypatch.setattr(watch, "GRACE_S", BEAT_S)
     ends = Queue()
     monkeypatch.setattr(Rank, "_end", lambda rank, text, code: (rank._ended.set(), ends.put((rank, text, code))))

@@ -61,8 +61,8 @@ def last(run):
 
 
 def test_a_run_begins_with_weights(data, tmp_path, capsys):
-    """A new run has the file's weights and its normaliser; one that goes on takes its
-    checkpoint's, even where the file is gone, and says so."""
+    """A new run starts with the file's parameters and normaliser. A resumed run uses its checkpoint, even if the file
+    is missing, and prints this."""
     file = weights_file(tmp_path / "begin.safetensors")
     tiny = {"learning_rate": 1e-12, "final_learning_rate": 1e-12, "maximum_updates": 1}
     mapping = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny)
@@ -148,9 +148,9 @@ def test_the_optimiser_is_the_configured_one(name, kind):
 
 
 def test_an_export_sets_rest_walls_and_obstacles(finished, tmp_path):
-    """Of a checkpoint, of a weights file, also in its own place, and of shipped weights by their name. Tensors, updates
-    and what else is known of them stay; the provenance says what was changed, of which file, and holds that file's own.
-    Networks that have no contacts to rest on are refused, and so is each for what exists."""
+    """Exports change constraints of checkpoints, weights files (also in place) and shipped weights. Tensors, updates
+    and other metadata stay. The provenance names the changes and the file, and contains the file's own provenance.
+    Networks with absolute inputs refuse rest_threshold. Changes without an output file are refused."""
     checkpoint, out = str(finished[1] / "checkpoints" / "last.ckpt"), str(tmp_path / "out.safetensors")
     file = weights_file(tmp_path / "trained.safetensors", inputs="relative")
     network, info = load_weights(file)

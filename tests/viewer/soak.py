@@ -33,7 +33,7 @@ NAMES = ("a.obj", "<img src=x onerror=alert(1)>.obj", "\x1b[31mb.obj", "c\0.obj"
 
 @dataclass
 class Viewer:
-    """One viewer: what the page has told it, and what it sends."""
+    """Represents a viewer: the messages that the page has sent to it, and those that it sends."""
 
     random: random.Random
     controls: dict[str, str] = field(default_factory=dict)  # labels and uuids

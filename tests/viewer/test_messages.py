@@ -109,9 +109,8 @@ def parts(page, name, count, size):
     ],
 )
 def test_messages_that_are_not_of_the_page(page, monkeypatch, message, passes):
-    """A viewer sets the values of controls, of the types that they have, and nothing else of them; only the button for
-    uploads takes files, with texts that are counted and numbers that other viewers can be sent; the server asks nobody
-    for an address."""
+    """A viewer can set only values of controls, of their types. Only the upload button accepts files, with bounded
+    texts and with numbers that can be sent to other viewers. The server requests no address."""
     asked, handled = [], page.server._websock_server._incoming_handlers
     for kind in (viser_compat.messages.ShareUrlRequest, viser_compat.messages.ScenePointerMessage):
         monkeypatch.setitem(handled, kind, [lambda client, message: asked.append(message)])
@@ -170,7 +169,7 @@ def test_viewers_of_another_version(page, caplog, version):
 
 
 def test_acknowledgements_of_parts_are_not_kept(page):
-    """Meshes that come in thousands of parts leave few messages for the viewers who come later."""
+    """Uploads of meshes in thousands of parts leave few stored messages for later viewers."""
     kept = page.server._websock_server._broadcast_buffer.message_from_id
     before = len(kept)
     for number in range(100):

@@ -169,8 +169,9 @@ def caught_up(page, play):
 
 
 def drag(page, begin, end, key=None, held_until=lambda: True):
-    """A mouse's way in steps, with the button held until a condition is met. The mouse trembles by a pixel meanwhile: a
-    busy browser may take the whole way for a drag's first motion, whose place it tells with the next one only."""
+    """Moves the mouse in steps, with the button pressed until a condition is true. Meanwhile the mouse moves back and
+    forth by a pixel: a busy browser may take the whole path for a drag's first motion, whose position it sends only
+    with the next one."""
     if key:
         page.keyboard.down(key)
     page.mouse.move(*begin)
@@ -199,7 +200,8 @@ def test_points_are_drawn(viewer, play):
 
 
 def test_a_drag_with_shift_pours(viewer, play):
-    """Particles of the chosen material enter while the mouse is held, above what it points at, and none thereafter."""
+    """Particles of the chosen material enter above the mouse's target while the button is pressed, and none
+    afterwards."""
     sliders: Any = play
     sliders.speed.value, sliders.diameter.value = 0.2, 0.2  # slow: nothing stops it before it is out of the domain
     begin, end = on_screen(play, (0.28, 0.0, 0.3)), on_screen(play, (0.32, 0.0, 0.3))
@@ -240,7 +242,7 @@ def test_an_obstacle_that_is_dragged_moves(viewer, play):
 
 
 def test_pause_step_and_back(viewer, play, monkeypatch):
-    """Pause holds the scene, Step makes one frame, Back takes frames away and holds it, Play goes on."""
+    """Pause stops the scene, Step simulates one frame, Back removes frames and pauses, and Play continues."""
     ways, rewind = [], play.session.rewind  # of each Back: a browser under load may send a click twice
     monkeypatch.setattr(play.session, "rewind", lambda to: (ways.append(play.session.frame - to), rewind(to)))
     press(viewer, "Pause")
@@ -303,8 +305,8 @@ def test_own_meshes(viewer, play):
 
 
 def test_two_viewers_and_a_lost_connection(viewer, play):
-    """A second viewer, without a browser, is sent the same scene and pauses for both; when all connections break the
-    scene goes on, and the page comes back to it."""
+    """A second viewer, without a browser, receives the same scene, and its pause affects both. When all connections
+    break, the scene continues, and the page connects again."""
     second = soak.Viewer(random.Random(0))
 
     async def pause():
@@ -329,9 +331,8 @@ def test_two_viewers_and_a_lost_connection(viewer, play):
 
 
 def test_who_may_read_the_page(play, caplog):
-    """Neither the page nor the websocket answers without the token, nor with another; the host is loopback's. What
-    other programs on this machine have left in the browser, in any form, does not close the page. A name that no file
-    can have is not found."""
+    """Neither the page nor the websocket answers without the token or with another one. The default host is loopback.
+    Cookies of other programs on this machine do not close the page. A name that no file can have returns 404."""
     bare, token = urljoin(play.address, "/"), urlsplit(play.address).path.strip("/")
     assert bare.startswith("http://127.0.0.1:") and play.address == f"{bare}{token}/" and len(token) > 20
     for address in (bare, f"{bare}wrong/", f"{bare}?token={token}"):
@@ -405,8 +406,8 @@ def viewed(page):
 
 
 def test_it_runs_while_somebody_looks_and_restarts_as_it_was():
-    """No frame before the first viewer, and none after the last has left. Restart goes on after a divergence, and stays
-    paused where a viewer paused. A disk that is full for a download is told, and ends nothing."""
+    """No frame is simulated before the first viewer connects or after the last one leaves. Restart continues after a
+    divergence, and keeps a viewer's pause. A full disk during a download causes a message and ends nothing."""
     session = PlaySession(floating(), load_scene(CONF / "example/play.yaml"), CONF / "example")
     page = PlayPage(session, port=0)
     thread = threading.Thread(target=page.run)

@@ -74,8 +74,8 @@ def test_untouched_it_is_a_rollout(session, folder):
 
 
 def test_spout(session):
-    """A spout gives as many particles a frame as its material has at rest in what leaves it, from its disc, at its
-    speed, until it is closed; and none while what it gave is still there."""
+    """A spout emits particles at the density of the material at rest, from its disc and at its speed, until it is
+    closed. It emits none while earlier particles are still in front of it."""
     session.use_weights(free_flight())
     session.set_gravity((0.0, 0.0, 0.0))
     session.spout = Spout((0.25, 0.9, 0.75), "sand", diameter=0.1, speed=0.6)
@@ -95,7 +95,8 @@ def test_spout(session):
 
 
 def test_obstacles_that_are_moved_hold(session):
-    """With `obstacle_clearance` what falls rests on an obstacle where it was dragged to, on none that was removed."""
+    """With `obstacle_clearance` falling particles rest on an obstacle at the place to which it was dragged, and pass a
+    removed one."""
     clearance = 1e-3
     session.use_weights(free_flight(obstacle_clearance=clearance))
     for obstacle in session.obstacles:
@@ -357,8 +358,9 @@ def test_the_rollout_is_saved(session, tmp_path):
 
 
 def test_other_weights_go_on_from_here(session):
-    """The state is kept to the bit, histories too, and what follows is the other network's; a rate or a material that
-    does not fit is refused and nothing changes. A history of another length begins with the last displacement."""
+    """Other weights continue from the bitwise same state and histories, and the next frames are those of the other
+    network. A frame rate or a material that does not fit is refused without a change. With another history length the
+    new history starts from the last displacement."""
     steps(session, 3)
     state = session.live.state
     with pytest.raises(ConfigError, match=r"weights must be for 60.0 frames per second, got 30.0"):

@@ -109,8 +109,8 @@ REFUSED = [
 
 @pytest.mark.parametrize(("action", "message"), REFUSED, ids=range(len(REFUSED)))
 def test_bad_input_is_answered(page, messages, action, message):
-    """Files that cannot be read, rays without a direction, gravity without bounds and weights that the page does not
-    offer are a message to the viewer who sent them; nothing is opened, and the session goes on as it was."""
+    """Unreadable files, rays without a direction, gravity that is too large, and weights that the page does not offer
+    cause a message to the viewer who sent them. No file is opened, and the session continues unchanged."""
 
     def state():
         session = page.session
@@ -163,7 +163,8 @@ def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, cap
 
 
 def test_an_update_that_fails_is_tried_again(page, monkeypatch, capsys):
-    """viser may fail where a viewer comes or goes: the session goes on, and the next round shows what is missing."""
+    """viser may fail when a viewer connects or leaves. The session continues, and the next iteration shows the missing
+    changes."""
     shown, failures = [], [RuntimeError("deque mutated during iteration"), asyncio.InvalidStateError("done")]
 
     def show():

@@ -55,9 +55,9 @@ assert numbers[7] == 7
 
 @pytest.mark.parametrize("home", ["none", "a file", "taken"])
 def test_without_a_home(tmp_path, home):
-    """Where HOME is not set, as in a system's service, Taichi would abort the process; where nobody can write to it, as
-    of a container's user, it would crash. Compiled kernels are then kept among temporary files, where nobody else
-    writes. A link that somebody else has put there is left alone."""
+    """Without HOME, as in a system's service, Taichi would abort the process. If HOME is not writable, as for a
+    container's user, it would crash. Compiled kernels are then in a private folder of temporary files. A link of
+    another user in its place is not used."""
     (tmp_path / "file").touch()
     (tmp_path / "program.py").write_text(PROGRAM)
     temporary, elsewhere = tmp_path / "temporary", tmp_path / "elsewhere"

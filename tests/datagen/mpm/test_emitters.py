@@ -31,9 +31,8 @@ ASIDE = Face((0.7, 0.65, 0.45), (-1.5, 0.0, 0.4), edges=(0.15, 0.1))
 
 
 def test_what_enters_flies_freely_and_none_is_lost():
-    """A face of area A at speed v brings in rho A v t, to a particle at any time and exactly in the end; whatever the
-    material, the centre of what entered is where free flight from the face has it, within 2e-4 of its way.
-    """
+    """A face of area A at speed v emits rho A v t, to one particle at any time, and exactly at the end. For each
+    material the centre of the emitted particles is that of free flight from the face, to 2e-4 of the path."""
     scenes = [jet(WATER, UP), jet(SNOW, ASIDE)]
     for scene, face, outcome in zip(scenes, (UP, ASIDE), simulated(scenes, frames=12), strict=True):
         late = scene.entry_s_N > 0
@@ -53,7 +52,7 @@ def test_what_enters_flies_freely_and_none_is_lost():
 
 
 def test_emitters_leave_their_batch_alone():
-    """A scene that particles enter is the same, bitwise, alone and beside others, and these are what they are alone."""
+    """In a batch with an emitter's scene, this scene and all others are bitwise equal to those simulated alone."""
     emitting = jet(WATER, UP)
     still = dataclasses.replace(emitting, entry_s_N=None)
     together = simulated([still, emitting, still], frames=6)

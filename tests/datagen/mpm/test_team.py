@@ -41,9 +41,9 @@ BOTH_SIDES = joined(ABOVE, block(np.arange(20) % 4, (0.3, 0.22, 0.3), (0.4, 0.28
 
 
 def test_teams_agree_with_the_other_launch():
-    """Scenes of other sizes, densities and obstacles beside them: one frame agrees to 1e-6, ten to 1e-3 of the
-    domain, in the order given; frames come one by one, and a scene that fails leaves the others as they were.
-    """
+    """The batch contains scenes of several sizes, densities and obstacles. One frame agrees to 1e-6 of the domain, ten
+    frames to 1e-3, in the given order. Frames are reported one by one, and a scene that fails does not change the
+    others."""
     scenes = [mixed(120, 0, (0, -3, 0)), HEAVY, mixed(1, 2, (0, 0, 0)), BOTH_SIDES]
     frames: list[int] = []
     expected = simulated(scenes, frames=11)
