@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
-from torch.utils.data import DataLoader, IterableDataset
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import WindowChunk
@@ -48,9 +47,11 @@ class EpisodeDataModule(LightningDataModule):
         self._fetched_from = (-1, -1)  # epoch and quarter of a window at the last request for shards
         self.waited_s = 0.0  # time that the training has waited for a chunk
 
-    def train_dataloader(self) -> DataLoader[WindowChunk | EpisodeChunk]:
-        # Episodes are read within milliseconds, so a worker process would cost more than it saves.
-        return DataLoader(_Stream(self), batch_size=None, num_workers=0)
+    def train_dataloader(self) -> "EpisodeDataModule":
+        return self
+
+    def __iter__(self) -> Iterator[WindowChunk | EpisodeChunk]:
+        return self.chunks()
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         return batch  # the updates copy it themselves
@@ -188,11 +189,3 @@ def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | N
             + "; is it a shared folder?"
         )
     return count
-
-
-class _Stream(IterableDataset[WindowChunk | EpisodeChunk]):
-    def __init__(self, feed: EpisodeDataModule) -> None:
-        self.feed = feed
-
-    def __iter__(self) -> Iterator[WindowChunk | EpisodeChunk]:
-        return self.feed.chunks()

@@ -45,7 +45,6 @@ def quieten() -> None:
     """Silences messages and hints of Lightning, because the commands print their own."""
     for package in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(package).setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")
     warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu was chosen on purpose
 
