@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_584,
+    "hgn": 34_574,
     "datagen": 8_932,
     "tools": 6_295,
-    "tests": 35_917,
+    "tests": 35_929,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -14,17 +14,15 @@ from hgn.scene.rollout_file import Rollout
 from hgn.schema import ConfigError
 
 
-def error_curve(
-    error_T: Mapping[str, np.ndarray], frame_rate_hz: float, size: tuple[int, int] = (720, 400)
-) -> Image.Image:
+def error_curve(error_T: Mapping[str, np.ndarray], frame_rate_hz: float) -> Image.Image:
     """Plots position errors over time on a logarithmic scale, one line for each entry of `error_T`.
 
-    error_T holds float64 [T] by name, as `position_error` returns it. size is width and height in pixels.
+    `error_T` contains float64 [T] by name, as `position_error` returns it. The picture has 720 x 400 pixels.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, layout="constrained")
+    figure = Figure(figsize=(7.2, 4.0), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     shown = False

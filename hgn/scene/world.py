@@ -153,10 +153,10 @@ class Layout:
         """Adds a cube at rest."""
         self.add("cube", (size, size, size), centre, material=material)
 
-    def box(self, low: Vector, high: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = "") -> None:
-        """Adds a box between two corners."""
+    def box(self, low: Vector, high: Vector, material: str) -> None:
+        """Adds a box at rest between two corners."""
         size = triple(np.array(high) - np.array(low))
-        self.add("box", size, triple(0.5 * (np.array(low) + np.array(high))), velocity, material)
+        self.add("box", size, triple(0.5 * (np.array(low) + np.array(high))), material=material)
 
     def tilt_gravity(self, tangent: float) -> None:
         """Turns gravity about a random horizontal axis, by twice the arc tangent of `tangent`."""

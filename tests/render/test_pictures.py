@@ -245,9 +245,9 @@ def test_position_error():
 
 
 def test_error_curve():
-    """The plot has the size asked for and its lines; errors of zero or NaN throughout draw without a warning."""
-    picture = error_curve(position_error(falling_blobs(30, 30)), 60.0, (500, 300))
-    assert picture.size == (500, 300)
+    """The picture shows the lines. Errors that are all zero or all NaN are drawn without a warning."""
+    picture = error_curve(position_error(falling_blobs(30, 30)), 60.0)
+    assert picture.size == (720, 400)
     assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 20
     error_curve({"all": np.zeros(5)}, 60.0)
     error_curve({"all": np.full(5, np.nan)}, 60.0)
