@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_574,
     "datagen": 8_932,
     "tools": 6_295,
-    "tests": 35_929,
+    "tests": 35_933,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -7,8 +7,8 @@ from hgn.schema import ConfigError
 
 
 def test_canary(tmp_path):
-    """Dataclasses are bases under their dotted names, in groups too; what its grammar refuses is quoted, what it does
-    not find is added; its own entry point composes the same; a key that must be given is named."""
+    """Dataclasses are bases under their dotted names, also in groups. Values that Hydra's grammar refuses are quoted,
+    and unknown keys are added. Hydra's own entry point composes the same. A missing required key is named."""
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "wide.yaml").write_text("defaults:\n  - hgn.config.SceneConfig\ngroup_size: 0.5\n")
     (tmp_path / "made.yaml").write_text(

@@ -258,7 +258,8 @@ def test_a_radius_with_no_or_all_neighbours_is_refused(tmp_path, capsys):
 
 
 def test_positions_in_another_unit_than_bounds_are_refused_for_bounds(tmp_path):
-    """Positions rounded to mm are neither refused for their resolution nor for their distances or gravity."""
+    """Positions rounded to mm are refused because of the bounds, not because of their resolution, distances or
+    gravity."""
     walk = np.random.default_rng(0).uniform(300, 460, (9, 125, 3)).round().astype(np.float32)
     simulations = {"train": [(walk, np.full(125, 5), NOTHING)]}
     source = write(tmp_path / "foreign", "plain", simulations, metadata(gravity=list(GRAVITY)))

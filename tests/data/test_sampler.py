@@ -55,8 +55,8 @@ def test_resume_equals_no_interruption(frames, batch, world_size, before, after)
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 2**31 - 1), min_size=1, max_size=64), st.integers(1, 9))
 def test_balanced_parts(size, ranks):
-    """Each sample goes to one rank, as many to each; no two ranks are further apart than the largest sample, and those
-    that all share one size stay in order."""
+    """Each sample goes to one rank, and all ranks have equal numbers of samples. The loads of two ranks differ by at
+    most the largest sample. If all samples have one size, they stay in order."""
     size_K = np.asarray(size * ranks)
     parts = balanced_parts(size_K, ranks)
     assert sorted(parts.flatten()) == list(range(len(size_K))) and len({len(part) for part in parts}) == 1
@@ -119,8 +119,8 @@ def test_windows(frames, window, world_size, cut):
 
 
 def test_what_cannot_be_resumed():
-    """An epoch goes on with its own seed, window and shards, later ones may be there; another epoch goes on
-    with any. A data set that has shrunk, or is empty, is refused."""
+    """An epoch resumes only with its own seed, window and shards; later shards may be added. At the start of an epoch
+    any are accepted. A data set that has shrunk, or is empty, is refused."""
 
     def digest(count):
         return f"digest {count}"

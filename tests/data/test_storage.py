@@ -335,8 +335,8 @@ def test_server_that_is_away_is_not_asked_at_once_again(folder, serve, monkeypat
 
 
 def test_what_is_within_reach(folder, serve, cache, monkeypatch):
-    """Who would rather go on than wait asks first: a server that is away, or a shard that a stopped process is
-    fetching, is no; what is here, comes at once, or is just fetched by another process, is yes."""
+    """`within_reach` is False for an absent server, and for a shard that a stopped process is fetching. It is True for
+    a local shard, for one that comes immediately, and for one that another process is fetching."""
     monkeypatch.setattr(shard_cache, "_STALLED_S", 0.1)
     url = serve()
     store = EpisodeStore(url, "train")

@@ -125,7 +125,7 @@ def command(backend, threads, tmp_path, monkeypatch, capfd):
 
 
 def test_makes_completes_and_leaves_alone(command, tmp_path):
-    """The command makes a data set from any working folder, says when it is complete, and then changes nothing."""
+    """The command makes a data set from any working folder, reports its completion, and then changes nothing."""
     code, output, errors = command(*SMALL, "out=made")
     assert code == 0 and output == "", errors
     assert errors.splitlines()[-1] == "made is complete: 3 train, 1 validation, 0 test episodes"

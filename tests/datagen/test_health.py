@@ -34,7 +34,7 @@ def ask(port):
 
 
 def test_the_last_report_is_answered(page):
-    """Another process answers, beside 100 connections that send nothing, too."""
+    """A separate process answers, even with 100 connections that send nothing."""
     told, port = page
     assert told.process.pid != os.getpid()
     assert ask(port) == (503, {"status": "the service has not started"})
@@ -51,7 +51,7 @@ def test_the_last_report_is_answered(page):
 
 
 def test_silence_is_told(monkeypatch):
-    """A service that reports nothing for long is not well, whatever it reported last."""
+    """A service that has not reported for a long time is unhealthy, whatever its last report."""
     with Page(socket.create_server(("127.0.0.1", 0))) as page:
         page.read('[200, {"status": "ok"}]')
         assert page.answer() == (200, b'{"status": "ok"}')

@@ -69,7 +69,7 @@ def test_seeds_are_stable_and_distinct():
 
 @given(split=SPLITS, first=st.integers(0, 2_000_000), size=st.integers(1, 9))
 def test_shard_names_parse_back(split, first, size):
-    """A name tells split and range, also past six digits; files of other people in the folder are left alone."""
+    """A name contains split and range, also with more than six digits. Other files in the folder are ignored."""
     shard = ShardRange(split, first, first + size)
     assert parse_shard_name(shard.name) == shard
     for name in ("train-0-1.tar", "train-000001-000001.tar", "extra-000000-000001.tar", "train-000000-000001.tar.gz"):

@@ -1,4 +1,4 @@
-"""The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
+"""Tests the pool: whatever happens to its workers, the data set becomes complete, and no process remains."""
 
 import contextlib
 import dataclasses
@@ -219,9 +219,10 @@ FAULTS = [  # a file that steers the stand-in and its content, scenes a launch, 
 
 @pytest.mark.parametrize(("sign", "content", "scenes", "cause", "count"), FAULTS)
 def test_a_scene_at_fault(make_config, backend, control, threads, monkeypatch, sign, content, scenes, cause, count):
-    """A worker that is killed once costs a retry of the same seed. A scene that kills its worker MAXIMUM_ATTEMPTS times
-    alone, found by halves of its batch, is quarantined; one that cannot be made or simulated, or whose grid cannot be
-    built, is at once, for trying the same seed again would not help. The next seed replaces it."""
+    """If a worker is killed once, its scene is retried with the same seed. A scene that alone kills its worker
+    MAXIMUM_ATTEMPTS times is found by halving its batch, and quarantined. A scene that cannot be made or simulated, or
+    whose grid cannot be built, is quarantined immediately, because a retry of the seed would not help. The next seed
+    replaces it."""
     monkeypatch.setattr(pool, "MAXIMUM_ATTEMPTS", 2)
     config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
     (control / sign).write_text(content)
@@ -337,7 +338,7 @@ def test_tars_are_those_of_tarfile(folder, tmp_path):
 
 
 class StoppedWorker(LocalWorker):
-    """One that says nothing."""
+    """A worker that sends nothing."""
 
     def __init__(self):
         Worker.__init__(self)

@@ -38,7 +38,7 @@ def test_lost_node(control, tmp_path):
 
 
 def test_no_cluster(make_config, monkeypatch):
-    """Without Ray, or without a cluster, the message says what to do."""
+    """Without Ray, or without a cluster, the message contains the remedy."""
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"needs Ray, which is not installed; pip install 'hgn\[ray\]'"):
         RayWorkerFactory(make_config(pool="ray"), Backend())

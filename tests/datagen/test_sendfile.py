@@ -82,7 +82,7 @@ def test_uvloop_is_left_alone(port, file):
 
 
 def test_ranges_on_one_connection(port, file):
-    """Many answers come over one connection, each with just the bytes that were asked for."""
+    """One connection carries many answers, each with exactly the requested bytes."""
     content, connection = file.read_bytes(), http.client.HTTPConnection("127.0.0.1", port)
     for asked, status, start, stop in (
         (None, 200, 0, SIZE),
@@ -110,7 +110,7 @@ def test_ranges_on_one_connection(port, file):
 
 
 def test_reader_that_leaves(port, file, caplog):
-    """A reader that goes away amidst an answer costs nothing but that answer, and no line in the log."""
+    """If a reader disconnects during an answer, only this answer fails, and nothing is logged."""
     caplog.set_level(logging.WARNING)
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", port)) as leaving:
@@ -143,7 +143,7 @@ def waiting(port, sent):
 
 @pytest.mark.parametrize("sent", [b"", HALF])
 def test_who_only_waits_keeps_nobody_out(serve, sent, file):
-    """More connections than the limit that send nothing, or half a request, make room for one that asks."""
+    """Connections beyond the limit that send nothing, or half a request, are closed for one that sends a request."""
     server, port = serve(**EIGHT)
     with ExitStack() as stack:
         for _ in range(40):

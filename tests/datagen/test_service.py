@@ -1,4 +1,4 @@
-"""The service: what it serves, to whom, and what becomes of it when something is at fault."""
+"""Tests the service: its files, its access control, and its handling of faults."""
 
 import asyncio
 import json
@@ -88,7 +88,7 @@ def test_manifest_and_its_etag(ask, folder):
 
 
 def test_index(ask, folder):
-    """The index's files come as far as the manifest says, whole or in part."""
+    """The service sends the index's files up to the sizes in the manifest, whole or in part."""
     path = folder / "index" / "1-000000.jsonl"
     content = path.read_bytes()
     path.write_bytes(content + b"not yet published")
@@ -167,8 +167,8 @@ REFUSALS = [  # the path, the method, the service's token, what is given as one;
 
 
 def test_refusals(ask, folder):
-    """Nothing but published files is served, to nobody without the token, and no method but GET and HEAD does
-    anything."""
+    """The service sends only published files, and none without the token. Only the methods GET and HEAD have an
+    effect."""
     (folder.parent / "outside.txt").write_text("secret")
     for name in OTHERS[2:]:
         (folder / name[1:]).write_bytes(b"not listed")
@@ -215,7 +215,7 @@ def test_damage_is_not_served(ask, folder):
 
 
 def test_progress_and_metrics(ask):
-    """Both tell what is published and what the pool is at; the metrics parse as Prometheus text."""
+    """Both report the published episodes and the pool's state. The metrics are valid Prometheus text."""
     progress = json.loads(ask("/progress")[2])
     assert progress["episodes"]["train"] == {"requested": 5, "published": 5} and progress["complete"]
     generator = progress["generator"]
@@ -281,8 +281,8 @@ def test_full_disk_is_waited_for(make_config, backend, tmp_path):
 
 @pytest.mark.parametrize("error", [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left"), KeyError("fault")])
 def test_log_that_nobody_reads(make_config, monkeypatch, error):
-    """Whoever reads the log may leave, and its disk may be full: generation goes on. A fault of ours ends the service,
-    and what is said of the generator is true."""
+    """Generation continues if the log's reader ends, or if its disk is full. An internal error ends the service, and
+    the reported state of the generator is correct."""
 
     class Log(Progress):
         def message(self, text):

@@ -1,4 +1,4 @@
-"""Locks, staged episodes and quarantine: whatever interrupts a writer, the next goes on to the same shards."""
+"""Tests locks, staged episodes and quarantine: after any interruption the next writer makes the same shards."""
 
 import dataclasses
 import os
@@ -198,10 +198,9 @@ def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seco
 
 @pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal", "device", "pipe"])
 def test_broken_staged_file_is_made_again(make_config, make_dataset, small_dataset, stage, damage):
-    """A staged file that is not what was written (positions that are zeros read like any others) is dropped and its
-    episode made again; so the shards are those of a run in peace. One that changes after it was checked is not packed.
-    Nor is a device or a pipe read, of which reading would not end.
-    """
+    """An altered staged file is dropped and its episode made again, even if it can be read (zero positions). The shards
+    equal those of an undisturbed run. A file that changes after its check is not packed. A device or a pipe is not
+    read, because reading might not end."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 1)
         staged = writer.folder / ".staging" / "train-000001.tar"

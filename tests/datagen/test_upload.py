@@ -44,7 +44,7 @@ def test_copy_is_the_data_set(make_config, make_dataset, capsys):
 
 @pytest.mark.parametrize("signalled", [False, True])
 def test_copying_that_is_cut_off(folder, monkeypatch, store, signalled):
-    """Whatever copying ends at, nothing is listed that is not there, and the same command completes it; after a signal
+    """Wherever copying ends, the index lists no missing file, and the same command completes the copy. After a signal
     no further shard is copied."""
     real, sent = type(store).put_file, []
 

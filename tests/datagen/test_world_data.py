@@ -18,7 +18,8 @@ KINDS = {"edge": 1.0, "pool": 3.0, "jet": 0.0}
 
 
 def test_one_batch_has_scenes_of_several_domains():
-    """Each result belongs to its task, whatever order the launches have; the episode knows its domain and meshes."""
+    """Each result is stored for its own task, whatever the order of the launches. The episode contains its domain and
+    meshes."""
     config = DatagenConfig(
         SceneConfig(domain_size=(2.0, 1.5, 1.5), kinds=KINDS, particles_per_cell=1.0),
         MpmConfig(device="cpu"),

@@ -132,8 +132,8 @@ def full_disk(monkeypatch):
 
 @pytest.mark.parametrize(("together", "after"), [*((False, n) for n in range(4)), *((True, n) for n in (0, 4, 10))])
 def test_full_disk_leaves_nothing_half_written(make_config, make_dataset, stage, full_disk, together, after):
-    """A full disk at any step, of one packer or several, ends the run with its message, keeps what was there and leaves
-    no partial file; with space the run goes on."""
+    """A full disk at any step, of one packer or several, ends the run with a message, keeps finished files and leaves
+    no partial one. With space the run continues."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
         publish(writer)

@@ -90,7 +90,8 @@ def extension(name):
 
 
 def test_names_exist():
-    """What a page says to be in a file is there: "`NAME` in `FILE`", and names in brackets behind a file of tests."""
+    """Names that a page locates in a file exist there: "`NAME` in `FILE`", and names in brackets after a file of
+    tests."""
     checked = 0
     for page in OWN_PAGES:
         text = "\n".join(line for _, line in prose_lines(page))

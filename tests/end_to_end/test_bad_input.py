@@ -1,4 +1,4 @@
-"""Bad input to the commands: one line that says what is wrong, a non-zero exit code, and nothing touched."""
+"""Tests bad input to the commands: one line with the fault, a non-zero exit code, and no changed file."""
 
 import json
 import math
@@ -245,7 +245,7 @@ def test_frames_before_a_divergence_are_written(place, capsys, monkeypatch):
 
 
 def test_diverging_scenes_are_told(place, capsys):
-    """An evaluation keeps what each scene came to, and says which one diverged first, and why."""
+    """An evaluation keeps the results of every scene, and names the first one that diverged, with the cause."""
     place.accelerate(0.4)
     options = {"weights": "weights.safetensors", "data": "data", "json": "made/errors.json"}
     assert evaluate.main(options) == 0

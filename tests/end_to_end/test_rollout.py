@@ -84,8 +84,8 @@ def test_a_network_without_obstacles_gets_none(tmp_path):
 
 
 def test_scenes(tmp_path, weights, small_pictures, monkeypatch):
-    """Seeds draw different scenes, an example has its name, a file of that name wins and a folder does not; with out
-    nothing is drawn unless asked."""
+    """Different seeds draw different scenes. An example is found by its name; a file of this name has priority, and a
+    folder does not. With out=... no pictures are drawn by default."""
     monkeypatch.chdir(tmp_path)
     sizes = set()
     for seed in (1, 2):

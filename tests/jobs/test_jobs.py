@@ -85,8 +85,8 @@ def warm(warm_python):
 
 
 def test_files_are_valid():
-    """Shellcheck finds nothing in a script and each may be executed; the table names each launch file, and none that is
-    not there. sbatch reads its options only before the first command; where tasks train, there is one for each GPU."""
+    """Shellcheck finds no fault in the scripts, and all are executable. The table names every launch file, and no
+    others. sbatch reads its options only before the first command. Training jobs have one task for each GPU."""
     shellcheck = [str(Path(sysconfig.get_path("scripts")) / "shellcheck"), "--shell", "bash"]
     checked = subprocess.run([*shellcheck, *map(str, SCRIPTS)], capture_output=True, text=True)
     assert checked.returncode == 0, checked.stdout

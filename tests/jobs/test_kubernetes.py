@@ -149,7 +149,8 @@ def test_commands_take_what_the_files_give_them(composed):
 
 
 def test_files_fit_each_other():
-    """One image, one claim, one secret, one port: what one file names, another makes or the notes tell to make."""
+    """All files use one image, one claim, one secret and one port. Each name in a file is defined in another one, or
+    the notes explain how to create it."""
     assert len({container["image"] for container in containers()}) == 1
     text = "\n".join(path.read_text() for path in K8S.glob("*.yaml"))
     claims = set(re.findall(r"claimName: (\S+)", text))

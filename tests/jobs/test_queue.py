@@ -75,7 +75,7 @@ def test_gpus_share_a_list(machine):
 
 @pytest.mark.parametrize("gpus", [["5"], ["GPU-8a", "MIG-1"], ["3", "2", "7"]])
 def test_visible_gpus(tmp_path, gpus):
-    """CUDA_VISIBLE_DEVICES says which GPUs there are; nvidia-smi is not asked."""
+    """CUDA_VISIBLE_DEVICES determines the GPUs, and nvidia-smi is not called."""
     write_program(tmp_path / "programs" / "nvidia-smi", "#!/usr/bin/env bash\ntouch asked; exit 1\n")
     meet = f"until [[ $(ls ? | wc -l) == {len(gpus)} ]]; do sleep 0.02; done; echo $CUDA_VISIBLE_DEVICES"
     text = "".join(f"{i}: touch {i}; {meet}\n" for i in range(len(gpus)))
@@ -92,8 +92,8 @@ def test_without_gpus(machine):
 
 
 def test_failing_and_going_on(machine):
-    """A command that fails stops no other before the barrier, and all behind it. The same call runs what is not done,
-    and that alone; a third finds nothing to do."""
+    """A command that fails stops all commands after the barrier, and none before it. The same call then runs only
+    commands that are not done. A third call finds none."""
     text = "good: echo good >> ran\nbad: echo bad >> ran; [[ -e mended ]]\nother: echo other >> ran\n"
     text += "wait\nbehind: echo behind >> ran\n"
     done = run(machine, text)
@@ -140,8 +140,8 @@ while true; do sleep 0.02; done
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signals_reach_the_commands(machine, number):
-    """Commands get SIGTERM, and what they still have to write is waited for, in pipes and in the background too; their
-    lines do not go on, no other line begins, and the same call goes on with all of them."""
+    """Commands get SIGTERM, and the queue waits for their last output, also of pipes and background processes. Their
+    lines do not continue, no other line starts, and the same call resumes all of them."""
     write_program(machine / "programs" / "training", TRAINING)
     lines = [
         "a: [[ -e quick ]] || training a; [[ -e quick ]] || touch went_on",
@@ -350,8 +350,8 @@ def test_mechanics(listed):
 
 
 def test_judged(listed):
-    """jobs/judged.txt trains on both data sets that it makes, judges what it exports by each question, and reports it
-    on fresh scenes that are drawn behind it."""
+    """jobs/judged.txt trains on the two data sets that it makes, checks the exported weights with each test, and
+    reports on fresh scenes, which are drawn afterwards."""
     lines = listed("judged.txt")
     assert list(lines)[-2:] == ["fresh", "report"]
     rest, motion, fresh = (lines[name]["datagen"] for name in ("rest_data", "motion_data", "fresh"))

@@ -18,7 +18,7 @@ from hgn.config import MATERIAL_EMBEDDING
 
 @dataclass(frozen=True)
 class Launch:
-    """What a kernel was given and what it left."""
+    """Holds the arguments and results of a kernel."""
 
     kernel: str
     given: dict[str, Any]  # by the kernel's names; tensors as they were before
@@ -46,7 +46,7 @@ class Launch:
         return operand.double()
 
     def pairs(self, outputs):
-        """Of each output its name, what was left, what should have been, and the size of its summands."""
+        """Returns for each output its name, the kernel's result, the expected result, and the size of the summands."""
         for name, output in outputs.items():
             if isinstance(output, Added):
                 shape = output.value.shape

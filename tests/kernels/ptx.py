@@ -66,12 +66,10 @@ def places_read(lines, value, threads):
 
 
 def hazards(ptx):
-    """Writes to shared memory that one group of four warps may make while another's product still reads it.
-
-    After a wait for products each group goes on by itself: Triton's wait does not hold the others (triton issue 11047,
-    mended in 3.9), so that between a wait and the next write to what any product reads there must be a barrier. Kernels
-    of one group have none. A write or an operand whose place is not known counts as one.
-    """
+    """Returns writes to shared memory by a group of four warps while the product of another group may still read it.
+    After a wait for products each group continues independently: Triton's wait does not stop the others (triton issue
+    11047, fixed in 3.9). A barrier is therefore needed between a wait and the next write to the operands of a product.
+    Kernels of one group have no such writes. A write or an operand with an unknown address counts as one."""
     threads = int(re.findall(r"\.reqntid (\d+)", ptx)[0])
     if threads <= 128:
         return []

@@ -45,8 +45,8 @@ def test_the_checker_sees_what_has_gone():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_a_pass_without_room_stays_within_memory(training):
-    """Where only the coarse level has too little room, cells of the fine one have no parent: the pass is void, and
-    reads nothing in its place. The same where particles are outside of the window, or nowhere."""
+    """If only the coarse level has too little capacity, cells of the fine level have no parent. The pass then has no
+    effect and reads no other memory. The same holds for particles outside the window, or without a position."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.05)
     state = random_state((4, 3), obstacles=False, spread=0.9)
     precision = "fp32"

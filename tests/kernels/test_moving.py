@@ -99,9 +99,10 @@ def passed(path_TN3, scenes):
 
 @pytest.mark.parametrize("overlap", [False, True])
 def test_moving_barriers(overlap, monkeypatch):
-    """Obstacles that translate, turn, and come from two sides push particles of some scenes of a batch: the frames are
-    PyTorch's in float64, over several blocks, and nothing passes an obstacle. With `overlap` blocks start before those
-    before them are looked at, and buffers grow. PyTorch's own float32 is 8e-8 away; a pose of another frame is 1e-3."""
+    """Obstacles that translate, rotate, and come from two sides push particles of some scenes of a batch. The frames
+    are PyTorch's in float64, over several blocks, and no particle passes an obstacle. With `overlap` blocks start
+    before earlier ones are read, and buffers grow. PyTorch's own float32 differs by 8e-8; a pose of another frame by
+    1e-3."""
     monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
     monkeypatch.setattr(triton_stepper, "FEWEST_FRAMES", 2)
     scenes, simulator = pushed_scenes(), thrown("triton", **PUSHED)

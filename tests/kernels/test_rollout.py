@@ -109,9 +109,9 @@ def motion(simulator, scenes, frames):
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_frames_are_those_of_the_plain_loop(name):
-    """Of scenes at once, of different gravity, one without obstacles: positions and histories by backends cpu and
-    triton are backend torch's, frame by frame. Particles that are thrown about stay between the walls, of which z has
-    none in two dimensions, and come no nearer where they begin beyond; they pass their own scene's obstacles never."""
+    """For a batch of scenes with different gravity, one without obstacles, positions and histories of backends cpu and
+    triton equal those of backend torch, frame by frame. Particles stay between the walls (in two dimensions z has
+    none), do not come closer if they start beyond, and never pass an obstacle of their scene."""
     changes = FRAMES[name]
     held, walls = "obstacle_clearance" in changes, changes.get("wall_clearance")
     elastic = "elastic" in changes.get("own_physics", ())
@@ -155,9 +155,9 @@ def test_frames_are_those_of_the_plain_loop(name):
 
 
 def test_obstacles_that_hold_change(monkeypatch):
-    """A simulation that began among no obstacles goes on with others, captured once, and with none again; what is
-    given it replaces those of the state. The frames are those of new simulations, to the rounding of a GPU's sums.
-    One that goes on among the same barriers makes no other table of them."""
+    """A simulation that starts without obstacles continues with others, captured once, and without them again.
+    Obstacles that are given replace those of the state. Frames equal those of new simulations, to the rounding of a
+    GPU's sums. With the same barriers no new table is made."""
     changes = {"obstacle_clearance": 2e-3}
     places = ((0.1, 0.1, 0.1), (0.08, 0.12, 0.1))
     scenes = [scene(12), *(replace(scene(12), corners=partial(crossed, at)) for at in places)]
@@ -199,8 +199,8 @@ def test_divergence_is_seen_through_walls(value):
 
 
 def test_free_flight_is_not_refused():
-    """What relative inputs put out in free flight is rounding alone, which differs as a whole; both loops fall with
-    gravity to 1e-3 of it. A network whose weights differ is still refused where something happens."""
+    """In free flight relative inputs give outputs of rounding only, which differ completely between backends. Both
+    loops fall with gravity to 1e-3 of it. A network with other weights is still refused for other motion."""
     thrown = scene(12, low=0.45, gravity=(0.0, -5.0, 0.0), domain_size=(1.0, 1.0, 1.0))
     thrown = replace(thrown, velocity_N3=np.full((12, 3), 1.7, np.float32))
     paths = [
@@ -236,9 +236,9 @@ def test_automatic_precision_is_lowered_where_refused(half_fails):
 
 
 def test_later_simulations_begin_anew(monkeypatch):
-    """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
-    too; the frames are bitwise those of a new simulator, after one that diverged as well, which gives its good frames
-    first. So are frames computed one by one while another simulation runs; the one that ends last is kept."""
+    """A simulator uses its captured graphs again, also for fewer particles, other obstacles and other gravity. The
+    frames are bitwise those of a new simulator, also after a divergence, before which the good frames are returned.
+    This holds for single frames during another simulation too; the buffers of the one that ends last are kept."""
     monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
     first, second = scene(3), scene(2, 1, gravity=(0.0, 2.0, 0.0))
     again, other = (Simulator(network(inputs="relative"), 60.0, "triton", "fp32") for _ in range(2))
@@ -265,8 +265,8 @@ def test_later_simulations_begin_anew(monkeypatch):
 
 
 def test_scenes_that_change():
-    """Particles that enter, other obstacles, other gravity and an earlier frame are those of the plain loop; what was
-    captured is used for all of them while there is room, and captured anew where there is not."""
+    """With entering particles, other obstacles, other gravity and an earlier frame the frames equal those of the plain
+    loop. The captured graph is used for all changes while capacities suffice, and is captured again if not."""
     paths, growing = [], []
     for backend, precision in (("torch", "fp32"), ("triton", "fp32")):
         simulator = Simulator(network(inputs="relative"), 60.0, backend, precision)
@@ -397,7 +397,8 @@ def test_a_scene_that_diverges_ends_alone():
 
 
 def block(density, cell_size, cells):
-    """Water at rest in a cube of so many cells, so many times as dense as the data's: 90 particles in a cell."""
+    """Returns water at rest in a cube of this number of cells. A density of 1 is that of the data: 90 particles in a
+    cell."""
     count = round(90 * density * cells**3)
     state = random_state((count,), obstacles=False, dtype=torch.float32)
     unit_N3 = torch.rand(count, 3, generator=torch.Generator().manual_seed(1))

@@ -109,9 +109,8 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, distance, monk
 
 
 def test_without_symmetry_nothing_changes():
-    """With noise and jitter, an update under identities is the one without symmetries, which ignores them: bitwise in
-    what the network sees, and on a CPU in what follows; a GPU takes sums in another order each time.
-    """
+    """With noise and jitter, an update under identities equals the one without symmetries, bitwise in the network's
+    inputs. On a CPU its results are bitwise equal too; a GPU adds in another order each time."""
     network = small_network()
     seen, ends = [], []
     for symmetry, known in (("none", EIGHT), ("gravity", EIGHT[:1])):

@@ -47,8 +47,9 @@ def test_what_the_interpreter_forgives(lines):
 
 @pytest.mark.slow
 def test_who_starts_early_waits(lines):
-    """Every kernel that may start before the one before it has ended waits for that, and those of a forward pass before
-    they write; but for three whose writes nobody before them looks at: beside the tables, the encoder, the decoder."""
+    """Every kernel that may start before the end of the previous one waits for this end, and those of a forward pass
+    wait before they write. Exceptions are three whose writes no earlier kernel reads: those of the tables, the encoder
+    and the decoder."""
     early = [(name, int(waits), int(writes)) for name, waits, writes in (x[1:] for x in lines if x[0] == "EARLY")]
     assert {name for name, *_ in early} >= {"mlp_forward", "gather_project", "particle_cell_forward", "advance"}
     assert all(waits for _, waits, _ in early), early

@@ -135,7 +135,7 @@ def test_keys_round_trip(scene, cell):
 
 
 def test_nothing():
-    """An empty scene has empty levels, and nothing is found where nothing is."""
+    """An empty scene has empty levels, and a search for cells in it returns none."""
     assert [level.cell_count for level in build(torch.zeros(0, 3)).levels] == [0, 0]
     index, found = find(torch.zeros(0, dtype=torch.long), torch.tensor([3, 4]))
     assert index.tolist() == [0, 0] and found.tolist() == [False, False]

@@ -103,8 +103,8 @@ def test_the_force_of_a_floor_lies_in_its_cone(friction):
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_friction_slows_and_never_reverses(tilt):
-    """For 40 random networks and bodies that move as one, on a level or tilted floor, friction opposes the velocity
-    that it leaves: its power is never positive, neither before nor after it acts."""
+    """For 40 random networks and rigid motions on a level or tilted floor, friction opposes the velocity: its power is
+    never positive, with the velocity before and after it."""
     gravity, kept = (2.7e-3 * math.sin(tilt), -2.7e-3 * math.cos(tilt), 0.0), 0
     for seed in range(40):
         speed = np.random.default_rng(seed).normal(size=3) * (4e-3, 0.0, 4e-3) * (seed % 4 > 0)

@@ -1,4 +1,4 @@
-"""Slow deformations of what touches rest: what holds for any weights, in float64."""
+"""Tests that slow deformations of bodies in contact stop, for any weights, in float64."""
 
 from dataclasses import replace
 

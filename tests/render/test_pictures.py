@@ -115,8 +115,8 @@ def flat_rollout():
 
 
 def test_flat_rollouts_are_drawn_in_their_plane(tmp_path):
-    """Seen straight on: places are in proportion along both axes, obstacle cells are filled, and nothing is shaded by
-    what lies above it. Animations and files keep that."""
+    """The camera faces the plane: positions are in proportion along both axes, obstacle cells are filled, and there are
+    no shadows. Animations and files keep the two dimensions."""
     rollout = flat_rollout()
     write_rollout(tmp_path / "flat.vtkhdf", rollout)
     rollout = read_rollout(tmp_path / "flat.vtkhdf")
@@ -263,7 +263,7 @@ def test_particle_spacing():
 
 
 def test_episode_as_rollout(tmp_path):
-    """An episode alone is no prediction and is not labelled as one; beside a prediction it is the ground truth."""
+    """An episode without a prediction is not labelled as one. With a prediction it is the ground truth."""
     blobs = falling_blobs(4, 6)
     assert blobs.reference_TN3 is not None
     episode = make_episode(

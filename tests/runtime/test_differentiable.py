@@ -123,8 +123,9 @@ def test_positions_are_those_of_a_rollout(kind):
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.5])
 def test_obstacles_hold_where_they_are_put(smoothing):
-    """A square that is turned and shifted into a particle's way stops it there: it ends at the clearance, where it came
-    to along the square. A shift moves it along the normal alone, its own start along the square alone."""
+    """A square that is rotated and shifted into a particle's path stops the particle at the clearance. The particle
+    keeps its position along the square. A shift of the square moves it only along the normal, and a shift of its own
+    start only along the square."""
     free = silent(network_of(inputs="relative", obstacle_clearance=CLEARANCE))
     down_13 = np.array([[0.0, -6.0, 0.0]], np.float32)  # 0.1 in a frame
     square = shape_obstacle("square", 0.2, (0.5, 0.125, 0.5))

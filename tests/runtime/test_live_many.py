@@ -64,8 +64,9 @@ def test_scenes_equal_each_alone(backend):
 
 
 def test_changes_of_one_scene():
-    """Particles, gravity, obstacles and an earlier frame change in one scene: with a silent network it rests on a
-    square and repeats that, while the other falls as if alone. A known past does not hinder them."""
+    """Particles, gravity, obstacles and an earlier frame change in one scene. With a network that predicts zero it
+    rests on a square and repeats this, and the other scene falls as if alone. Stored past frames do not prevent the
+    changes."""
     still = replace(scene(20, low=0.5), velocity_N3=np.zeros((20, 3), np.float32), obstacle_grid=EMPTY_GRID)
     under = replace(still, corners=lambda: square((0.6, 0.45, 0.6), 1, 0.6))
     simulator = Simulator(silent(network_of(torch.float32, **RELATIVE, obstacle_clearance=1e-3)), 60.0)

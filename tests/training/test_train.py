@@ -269,8 +269,8 @@ def test_training_learns(make_config, make_dataset, run):
 
 
 def test_damaged_checkpoints_are_refused(finished, capsys):
-    """Of the last three checkpoints the newest whole one is gone on with: one that was cut, or of which a bit changed,
-    is named and stays. Where none is whole the training ends with a message."""
+    """A training resumes from the newest intact one of the last three checkpoints. A cut or altered one is named and
+    stays. If none is intact, the training ends with a message."""
     data, run = finished
     paths = [run / "checkpoints" / name for name in LAST_NAMES]
     assert [read_checkpoint(path)["hgn"]["updates"] for path in paths] == [12, 10, 5]
@@ -321,7 +321,7 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
     ],
 )
 def test_data_that_do_not_go_together(data, make_config, make_dataset, tmp_path, changes, training, message):
-    """Are refused by what differs, before anything is started."""
+    """Data sets that do not fit each other are refused before anything starts, and the message names the difference."""
     training = dict(training)
     dataset = {"frames": 9} | changes.get("dataset", {})
     config = make_config(folder=str(tmp_path / "other"), seed=1, **dataset)

@@ -1,4 +1,4 @@
-"""What a run begins with, how it warms up, and the moving average it ends with."""
+"""Tests the initial weights of a run, the warm-up, and the moving average at the end."""
 
 from dataclasses import replace
 from pathlib import Path

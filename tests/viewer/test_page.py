@@ -270,7 +270,7 @@ def test_pause_step_and_back(viewer, play, monkeypatch):
 
 
 def test_scene_and_rollout_are_taken_away(viewer, play, tmp_path):
-    """Both come as downloads; the scene opens as it is now, the rollout has its frames."""
+    """Scene and rollout can be downloaded. The scene file contains the present state, and the rollout its frames."""
     with viewer.expect_download() as download:
         press(viewer, "Scene (YAML, zip)")
     zipfile.ZipFile(download.value.path()).extractall(tmp_path)

@@ -1,4 +1,4 @@
-"""What the page's buttons do, without a page."""
+"""Tests the actions of the page's buttons without the page."""
 
 import io
 import zipfile
@@ -399,7 +399,7 @@ def test_other_weights_go_on_with_added_particles(folder):
 
 
 def test_divergence_is_taken_back(session):
-    """What throws the scene apart is said, and the scene is as it was a frame before."""
+    """A divergence is reported, and the scene returns to the frame before it."""
     before_N3 = steps(session, 2)
     session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0)
     with pytest.raises(DivergedError, match="at frame 3"):

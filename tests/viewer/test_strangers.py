@@ -1,4 +1,4 @@
-"""What strangers send to the page of hgn.play: names, values, files and requests; no browser is needed."""
+"""Tests untrusted input to the page of hgn.play: names, values, files and requests, without a browser."""
 
 import asyncio
 import gc
@@ -276,7 +276,7 @@ def test_actions_that_wait_are_bounded(page, messages):
 
 
 def test_a_frame_that_fails_pauses(page, messages, monkeypatch, capsys):
-    """An unexpected error of the simulation pauses for everybody, and is told; Restart goes on."""
+    """An unexpected error of the simulation pauses the session and is shown to all viewers. Restart continues."""
     failed = []
 
     def step():

@@ -172,7 +172,7 @@ def test_sheets_do_not_leak():
 
 
 def test_tilted_sheets_and_bowls_do_not_leak():
-    """Nothing passes a tilted sheet from wall to wall, nor the wall of a bowl, at 10 m/s."""
+    """At 10 m/s no particle passes a tilted sheet from wall to wall, or the wall of a bowl."""
     turn, middle = euler_rotation((27.0, 0.0, 13.0)), np.array([0.5, 0.35, 0.5])
     tilted, bowl = (shape_obstacle(name, size, tuple(middle), of) for name, size, of in (
         ("square", 3.0, turn), ("half_sphere", 0.5, np.eye(3)),

@@ -1,4 +1,4 @@
-"""Contact by closed forms: what leaves an obstacle flies freely, what slides on it is braked by Coulomb's law."""
+"""Tests contact against closed forms: free flight away from an obstacle, and sliding with Coulomb friction."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Emitters: what enters flies freely from the face, at the rate of its train, and no particle is lost or made."""
+"""Tests emitters: particles fly freely from the face at the configured rate, and none is lost or added."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Obstacles that move: material goes along with them, and none comes through."""
+"""Tests moving obstacles: they move material with them, and no particle passes."""
 
 import dataclasses
 
@@ -72,9 +72,8 @@ def test_piston():
 
 
 def test_tilted_piston():
-    """Less than one in a thousand particles comes through tilted bodies that rise under snow and sand; snow, which does
-    not spread meanwhile, goes along with their speed within 5 %.
-    """
+    """Fewer than one in a thousand particles pass tilted bodies that rise under snow and sand. Snow, which does not
+    spread meanwhile, moves at their speed to within 5 %."""
     speed, start, seconds, height = 0.5, 0.1, 0.35, -4.0
     way = speed * (seconds - start) * TILT[:, 1]
     piston = moving(plate(height, TILT, True), [start, seconds], [np.zeros(3), way])

@@ -23,8 +23,8 @@ RAMP = "v -0.5 0 -0.5\nv 0.5 0 -0.5\nv -0.5 0 0.5\nv 0.5 0 0.5\nf 1 3 2\nf 2 3 4
 
 
 def test_a_scene_file_is_solved(tmp_path, monkeypatch):
-    """The file holds the scene's particles, which fall; drawn beside another simulation of it, it is the truth. The
-    bar's rate begins with frame 1, which includes compilation."""
+    """The file contains the scene's particles, which fall. In a drawing with another simulation of it, it is the ground
+    truth. The bar's rate starts at frame 1, which includes compilation."""
     rate_begins = []
     monkeypatch.setattr(tqdm, "unpause", lambda bar: rate_begins.append(bar.n))
     monkeypatch.chdir(tmp_path)
@@ -49,7 +49,7 @@ def test_a_scene_file_is_solved(tmp_path, monkeypatch):
 
 
 def test_a_scene_that_bursts(tmp_path, monkeypatch):
-    """What the solver cannot keep together is said, and nothing is written."""
+    """If the solver stops, the command prints the cause and writes no file."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", 1)
     Path("mine.yaml").write_text(SCENE.split("\n")[3])

@@ -59,7 +59,7 @@ def test_impact_at_ten_metres_per_second():
 
 
 def test_many_particles_in_one_cell():
-    """100,000 particles in a cell: a frame passes, finite, and nothing is lost."""
+    """A frame with 100,000 particles in a cell ends with finite positions, and no particle is lost."""
     scene = block(WATER, [8 * CELL] * 3, [9 * CELL] * 3, count=100_000)
     (outcome,) = simulated([scene], MpmConfig(device="cpu", stability_fraction=1.0))
     assert np.isfinite(outcome.position_TN3[-1]).all()

@@ -154,7 +154,7 @@ def test_blocks_that_are_not_at_work_at_once(monkeypatch):
 
 
 def test_more_than_runs(monkeypatch):
-    """Blocks that would wait for ever, and a batch beyond what int32 counts, are refused with the remedy."""
+    """Blocks that would wait for ever, and a batch beyond the range of int32, are refused with the remedy."""
     with pytest.raises(ConfigError, match=r"team.blocks must be at most 2, .*, got 3"):
         simulate([mixed(1, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1, 3))
     monkeypatch.setattr(team_launch, "MAXIMUM_PARTICLES", 10)
