@@ -115,7 +115,7 @@ class Launch(ABC):
         frame_rate_hz: float,
         stability_fractions: Sequence[float] | None = None,
     ) -> None:
-        self.scenes, self.colliders, self.config, self.node_counts = scenes, colliders, config, node_counts
+        self.scenes, self.colliders, self.config = scenes, colliders, config
         self.frame_s = 1 / frame_rate_hz
         if config.fixed_time_step_s is not None:
             self.frame_s = fixed_substeps(config, frame_rate_hz) * config.fixed_time_step_s

@@ -33,8 +33,8 @@ class CpuBackend(Backend):
     name = "cpu"
     network: HierarchicalGraphNetwork
 
-    def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
-        return cpu_network.prediction(self.network, state, origin_S3)
+    def prediction(self, state: ParticleState) -> Prediction:
+        return cpu_network.prediction(self.network, state)
 
 
 def choose(device: torch.device, network: ParticleNetwork, precision: str = "auto", backend: str = "auto") -> Backend:

@@ -37,13 +37,9 @@ class Backend:
         if self.device.type == "cpu":
             keep_freed_memory()
 
-    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """Returns the network's raw output [N, 3], with gradients if they are enabled."""
-        return self.prediction(state, origin_S3).acceleration_N3
-
-    def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
+    def prediction(self, state: ParticleState) -> Prediction:
         """Returns the raw output, and the contacts that the rest constraint needs."""
-        return self.network.prediction(state, origin_S3)
+        return self.network.prediction(state)
 
     def predict(self, state: ParticleState) -> torch.Tensor:
         """Returns the accelerations of a simulation [N, 3] in frame units, after the rest constraint."""
