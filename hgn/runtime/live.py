@@ -6,6 +6,7 @@ Shape legend: N particles, A particles that enter, M velocities of a history.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from numbers import Integral
 from typing import Any
@@ -27,7 +28,7 @@ from hgn.scene.scene import Scene
 from hgn.schema import Vector, require, require_count, triple
 
 
-class LiveSimulation:
+class LiveSimulation(AbstractContextManager["LiveSimulation"]):
     """One scene or several, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
     A change between two frames affects scene `index` from the next frame on. Particles that it does not add, remove or
@@ -60,9 +61,6 @@ class LiveSimulation:
         self._numbers = [0] * len(self.scenes)  # each scene's `frame`, which `restore` of another scene does not change
         # for `restore`: moving obstacles of each scene before each of its moves, with the frame of their keyframes
         self._before_moves: list[list[tuple[int, tuple[MovingObstacle, ...]]]] = [[] for _ in self.scenes]
-
-    def __enter__(self) -> LiveSimulation:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

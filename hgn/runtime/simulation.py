@@ -50,7 +50,7 @@ class Entry:
     state: ParticleState
 
 
-class Simulation:
+class Simulation(AbstractContextManager["Simulation"]):
     """Scenes that are simulated together. Use it as a context manager, or close it."""
 
     def __init__(
@@ -70,9 +70,6 @@ class Simulation:
         self._stepper_of, self._buffers = stepper_of, ExitStack()
         self.stepper: Stepper | None = None
         self.continue_from(state)
-
-    def __enter__(self) -> "Simulation":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

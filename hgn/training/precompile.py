@@ -14,7 +14,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from typing import Self
 
 import torch
 
@@ -123,7 +122,7 @@ def sizes_of(config: TrainConfig) -> tuple[int, tuple[int, ...]]:
     return scenes * max(1, round(particles)), tuple(cells)
 
 
-class Precompilation:
+class Precompilation(contextlib.AbstractContextManager["Precompilation"]):
     """Processes that compile kernels."""
 
     def __init__(
@@ -145,9 +144,6 @@ class Precompilation:
         text, (major, minor) = json.dumps(to_mapping(config)), capability
         common = [*map(str, (processes, 10 * major + minor, int(several_ranks)))]
         self._programs = [Program([*command, str(part), *common], file, text) for part, file in enumerate(outputs)]
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.stop()
