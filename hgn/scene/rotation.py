@@ -1,6 +1,7 @@
 """Rotations of points by plain sums and products, so that results do not depend on a BLAS library."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -39,17 +40,27 @@ def euler_rotation(degrees: Vector) -> np.ndarray:
 
     Quarter turns are exact, so an axis-aligned mesh stays axis-aligned.
     """
-    matrix = np.eye(3)
-    for axis, angle in enumerate(degrees):
-        reduced = math.fmod(angle, 360.0) % 360.0
-        radians = math.radians(reduced)
-        cosine, sine = _QUARTER_TURNS.get(reduced, (math.cos(radians), math.sin(radians)))
-        turn = np.eye(3)
+    return euler_rotations([degrees])[0]
+
+
+def euler_rotations(degrees_T3: Sequence[Sequence[float]]) -> np.ndarray:
+    """Returns the matrices of `euler_rotation`, float64 [T, 3, 3]."""
+    matrix_T33 = np.tile(np.eye(3), (len(degrees_T3), 1, 1))
+    for axis in range(3):
+        pair_T2 = np.array([_cosine_sine(degrees[axis]) for degrees in degrees_T3])
+        turn_T33 = np.tile(np.eye(3), (len(degrees_T3), 1, 1))
         first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn[first, first], turn[first, second] = cosine, -sine
-        turn[second, first], turn[second, second] = sine, cosine
-        matrix = rotate(matrix.T, turn).T  # turn times matrix; rotate() treats the columns as points
-    return matrix
+        turn_T33[:, first, first], turn_T33[:, first, second] = pair_T2[:, 0], -pair_T2[:, 1]
+        turn_T33[:, second, first], turn_T33[:, second, second] = pair_T2[:, 1], pair_T2[:, 0]
+        x, y, z = (turn_T33[:, :, k, None] * matrix_T33[:, k, None, :] for k in range(3))
+        matrix_T33 = x + y + z
+    return matrix_T33
+
+
+def _cosine_sine(degrees: float) -> tuple[float, float]:
+    reduced = math.fmod(degrees, 360.0) % 360.0
+    radians = math.radians(reduced)
+    return _QUARTER_TURNS.get(reduced, (math.cos(radians), math.sin(radians)))
 
 
 def rotate(point_P3: np.ndarray, rotation_33: np.ndarray) -> np.ndarray:

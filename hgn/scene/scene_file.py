@@ -23,7 +23,7 @@ from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
 from hgn.scene.particle_file import read_particles
-from hgn.scene.rotation import euler_rotation
+from hgn.scene.rotation import euler_rotation, euler_rotations
 from hgn.scene.scene import Obstacle, Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import (
@@ -40,7 +40,6 @@ from hgn.schema import (
     require,
     require_bounds,
     to_mapping,
-    triple,
 )
 from hgn.system.yaml_files import read_yaml
 
@@ -97,7 +96,7 @@ class ObstacleEntry:
         if not self.keyframes:
             return None
         key_T7 = _without_half_turns(np.array([(k.time, *k.translation, *k.rotation) for k in self.keyframes]))
-        rotation_T33 = np.array([euler_rotation(triple(degrees)) for degrees in key_T7[:, 4:].tolist()])
+        rotation_T33 = euler_rotations(key_T7[:, 4:].tolist())
         return Motion(key_T7[:, 0], key_T7[:, 1:4], rotation_T33, self.position or (0.0, 0.0, 0.0))
 
 
