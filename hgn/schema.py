@@ -19,7 +19,7 @@ import types
 import typing
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 from urllib.parse import unquote
@@ -305,6 +305,7 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
     if not rule_holds:
         choices = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else ()
         remedy = remedy or near_name(str(value), choices)
+        value = str(value) if isinstance(value, Path) else value
         raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
 
 
@@ -313,6 +314,13 @@ def require_count(field: str, value: object, least: int) -> None:
     whole = isinstance(value, Integral) and not isinstance(value, bool) and value < 2**63
     require(whole, field, "a whole number", value)
     require(value >= least, field, f"at least {least}", value)  # type: ignore[operator]
+
+
+def require_vector(field: str, value: Any, least: float = -1e15, most: float = 1e15) -> None:
+    """Raises ConfigError unless an argument is three numbers from `least` to `most`."""
+    items = [*value] if isinstance(value, (tuple, list)) or getattr(value, "shape", None) == (3,) else []
+    fits = len(items) == 3 and all(isinstance(x, Real) and least <= x <= most for x in items)  # type: ignore[operator]
+    require(fits, field, f"three numbers from {least:g} to {most:g}", value)
 
 
 def require_replaceable(field: str, *files: Path) -> None:

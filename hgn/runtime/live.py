@@ -25,7 +25,7 @@ from hgn.scene.motion import Motion
 from hgn.scene.moving import MovingObstacle
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
-from hgn.schema import Vector, require, require_count, triple
+from hgn.schema import Vector, require, require_count, require_vector
 
 
 class LiveSimulation(AbstractContextManager["LiveSimulation"]):
@@ -166,11 +166,12 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         moving, own = self.state.moving, [*self.scenes[index].moving]
         rule = f"0 to {len(own) - 1}, an obstacle" if own else "left out: the scene has no obstacles"
         _require_index("number", number, len(own), f"{rule} with keyframes")
+        for name, value in (("translation", translation), ("rotation", rotation)):
+            require_vector(name, value)
         assert moving is not None
         before, time_T = own[number].motion, (moving.frames[index] + np.arange(2)) * moving.frame_s
         turn_33, shift_3 = before.pose(time_T[0])
-        later_33 = euler_rotation(triple(_array("rotation", np.array(rotation), (3,))))
-        shift_T3 = np.stack([shift_3, _array("translation", np.array(translation), (3,))])
+        shift_T3, later_33 = np.stack([shift_3, translation]), euler_rotation(rotation)
         own[number] = replace(own[number], motion=Motion(time_T, shift_T3, np.stack([turn_33, later_33]), before.pivot))
         self._before_moves[index].append((moving.frames[index], self.scenes[index].moving))
         self._changed = replace(self.state, moving=self._moved(moving, moving.frames, index, own))

@@ -29,7 +29,7 @@ from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
-from hgn.schema import ConfigError, Vector, near_file, require
+from hgn.schema import ConfigError, Vector, near_file, require, require_vector
 from hgn.system.files import errors_name
 
 _FACET = re.compile(
@@ -73,8 +73,7 @@ def load_bodies(
     path = Path(path)
     require(0 < scale < np.inf, f"{field}: scale", "a finite number > 0", scale)
     for name, value in (("translation", translation), ("rotation", rotation)):
-        fits = np.shape(value) == (3,) and bool(np.isfinite(value).all())
-        require(fits, f"{field}: {name}", "three finite numbers", value)
+        require_vector(f"{field}: {name}", value)
     vertex_V3, triangle_F3 = _read(path, field)
     bad = np.flatnonzero(~np.isfinite(vertex_V3).all(axis=1))
     if len(bad):

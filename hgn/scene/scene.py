@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from hgn.config import MpmConfig
 from hgn.scene.kinds import require_few_cells
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
-from hgn.schema import ConfigError, Vector, require
+from hgn.schema import ConfigError, Vector, require, require_vector
 
 CELL_TOLERANCE = 1e-3  # largest difference of a domain's length from whole cells, in cells
 
@@ -91,9 +90,7 @@ def require_particles(
 def require_vectors(owner: Any) -> None:
     """Checks gravity, the domain's size and friction of walls. Raises: ConfigError unless they are three numbers."""
     for name, least in (("gravity", -1e9), ("domain_size", 0), ("wall_friction", 0)):
-        value = getattr(owner, name)
-        fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)  # type: ignore[operator]
-        require(fits, name, f"three numbers from {least:g} to 1e+09", value)
+        require_vector(name, getattr(owner, name), least, 1e9)
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ class LibraryFile(io.RawIOBase):
     def __init__(self, path: Path, mode: str = "rb") -> None:
         self._file = io.FileIO(path, mode)
         self.place, self.size = 0, os.fstat(self._file.fileno()).st_size
-        self.fault: OSError | None = None
+        self.fault: tuple[Any, ...] | None = None
 
     def close(self) -> None:
         self._file.close()
@@ -102,7 +102,7 @@ class LibraryFile(io.RawIOBase):
         try:
             count = os.preadv(self.fileno(), [buffer], self.place)
         except OSError as error:
-            self.fault = error
+            self.fault = error.args  # the error's traceback would keep objects of HDF5, which crash at the end
             raise
         self.place += count
         return count
@@ -119,7 +119,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
             yield io.BufferedReader(file)
         finally:
             if file.fault is not None:
-                raise file.fault
+                raise OSError(*file.fault)
 
 
 def open_at_once(path: Path) -> io.BufferedReader:
@@ -227,10 +227,10 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def errors_name(path: Path) -> Iterator[None]:
-    """Adds `path` to an OSError that names no file (a full disk)."""
+    """Adds `path` to an OSError that names no file (a full disk), or a temporary one."""
     try:
         yield
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None or str(error.filename).endswith(TEMPORARY_SUFFIX):
             error.filename = str(path)
         raise

@@ -13,6 +13,8 @@ from data.test_import import TYPES, options
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from hgn import import_trajectories
+from hgn.data.foreign.formats import set_info
+from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.tfrecord import read_records
 from hgn.schema import ConfigError
 
@@ -163,6 +165,7 @@ def pickled(content):
         ("lagrangebench", claimed, r"train.h5: /00000/position must keep the content within"),
         ("lagrangebench", partly_written, "train.h5: /00000/position must be written as a whole, got 1 of 9 chunks"),
         ("plain", npz("00000/gravity", np.array([0, 1e14, 0])), "00000: gravity must be at most .*, one box per"),
+        ("plain", meta(g_ext_magnitude=-9.8), "metadata.json: g_ext_magnitude must be >= 0, got -9.8"),
         ("plain", meta(dt=1e-10), "dt must be a finite number > 0, from 1e-09 to 1e.09, got 1e-10"),
         ("plain", meta(obstacle_cell_size=0), r"metadata.json: obstacle_cell_size must be from 1.53e-05 .*got 0.0"),
         ("plain", meta(materials=["water"]), r"metadata.json: materials must be names by number, got \['water'\]"),
@@ -248,6 +251,13 @@ def test_types_without_a_name_in_own_materials_are_refused(types, tmp_path):
     with pytest.raises(ConfigError, match=rf"particle_type must have a name for each number, got \[{number}\]"):
         import_trajectories.main(options(tmp_path / "mine", source, materials={}))
     import_trajectories.main(options(tmp_path / "mine", source, materials={str(number): "clay"}))
+
+
+def test_gravity_of_any_size(tmp_path):
+    """A gravity that is not compared with free flight by NumPy, which would warn."""
+    source = write(tmp_path / "foreign", "plain", {}, metadata(gravity=[0, -1e300, 0]))
+    with pytest.raises(ConfigError, match=r"gravity must be 3 finite numbers.*, at most 1e\+15, got \[0.0, -1e\+300"):
+        set_info(source, "plain", ImportConfig(out="mine"))
 
 
 @pytest.mark.parametrize("gravity", [None, [0.0, -9.8, 0.0]])

@@ -259,8 +259,9 @@ def test_a_program_moves_obstacles():
         for number, place, message in (
             (2, places[1], "number must be 0 to 1, an obstacle with keyframes, got 2"),
             (False, places[1], "number must be 0 to 1, an obstacle with keyframes, got False"),
-            (1, ((0.1, 0.1),), r"translation must be of shape \(3,\), got \(2,\)"),
-            (1, (places[1][0], (np.inf, 0, 0)), "rotation must be finite, got inf"),
+            (1, ((0.1, 0.1),), r"translation must be three numbers from .*, got \(0.1, 0.1\)"),
+            (1, ([[1, 2], [3], 4],), r"translation must be three numbers from .*, got \[\[1, 2\], \[3\], 4\]"),
+            (1, (places[1][0], (np.inf, 0, 0)), r"rotation must be three numbers from .*, got \(inf, 0, 0\)"),
         ):
             with pytest.raises(ConfigError, match=message):
                 live.move_obstacle(number, *place)

@@ -179,6 +179,7 @@ def scene_of(**change):
         (scene_of(wall_friction=(0, -1, 0)), "wall_friction must be three numbers from 0 to"),
         (scene_of(domain_size=(1, 1)), r"domain_size must be three numbers from 0 to 1e\+09, got \(1, 1\)"),
         (scene_of(gravity=-9.8), "gravity must be three numbers from -1e"),
+        (scene_of(gravity=([1], [2, 3], 4)), "gravity must be three numbers from -1e"),
         *((scene_of(material_parameters={"sand_friction_angle_deg": value}), message) for value, message in (
             (30.0, r"material_parameters\[sand_friction_angle_deg\] must be an array of shape \(1,\), got 30.0"),
             (np.array([130.0]), "sand_friction_angle_deg must be < 90, got 130.0"))),

@@ -9,6 +9,8 @@ import pickle
 import resource
 import signal
 import struct
+import subprocess
+import sys
 import tempfile
 import zipfile
 from pathlib import Path
@@ -355,6 +357,14 @@ def test_a_disk_that_fails(tmp_path, kind):
     decode = decode if kind != "tfrecord" else lambda path: list(read_records(path))
     with pytest.raises(OSError, match=rf"Input/output error: .*{name}"):
         decode(path)
+
+
+def test_a_disk_that_fails_while_hdf5_opens_a_file(tmp_path):
+    """The process ends as usual after the error. HDF5's objects crashed it if the error kept them."""
+    (tmp_path / "a.h5").symlink_to("/proc/self/mem")
+    program = "import sys, pathlib, hgn.scene.rollout_file as files; files.read_rollout(pathlib.Path(sys.argv[1]))"
+    ended = subprocess.run([sys.executable, "-c", program, tmp_path / "a.h5"], capture_output=True, check=False)
+    assert ended.returncode == 1 and b"Input/output error" in ended.stderr
 
 
 @pytest.mark.parametrize("kind", FILES)

@@ -405,7 +405,7 @@ def test_particles_of_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        (None, "must be an existing .npz or USD file"),
+        (None, "must be an existing .npz or USD file, got '"),
         (b"PK no zip", "must be a readable .npz file"),
         ({"velocity": np.zeros((2, 3))}, "must be a file with an array named position"),
         ({"position": np.zeros((2, 2))}, r"position must be of shape \(1, 3\), got \(2, 2\)"),

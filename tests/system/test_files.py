@@ -32,3 +32,11 @@ def test_marks_have_their_places(tmp_path, monkeypatch, block):
         for mark in (b'{"meta": {', b"provenance:\n"):
             path.write_bytes(before * b"." + mark + 80 * b".")
             assert files.is_replaceable(path) == (before == 0)
+
+
+def test_errors_name_the_file_that_was_to_be_written(tmp_path):
+    """The temporary file, which is gone, is not named."""
+    (tmp_path / "out").mkdir()
+    with pytest.raises(IsADirectoryError) as error:
+        files.write_atomically(tmp_path / "out", b"content")
+    assert error.value.filename == str(tmp_path / "out")

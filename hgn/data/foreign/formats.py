@@ -99,6 +99,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
     whole = all(abs(kind) <= 1e15 and kind == int(kind) for kind in boundary)
     require(whole, f"{folder}/metadata.json: boundary_types", "whole numbers, at most 1e15", boundary)
     size = given("g_ext_magnitude", None, ())
+    require(size is None or size >= 0, f"{folder}/metadata.json: g_ext_magnitude", ">= 0", size)
     gravity = given("gravity", config.gravity, (None,), [0.0] * int(dimensions) if size == 0 else None)
     if name == "lagrangebench" and config.dt is None:
         every = given("write_every", None, (), 1.0)

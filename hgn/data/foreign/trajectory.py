@@ -79,8 +79,8 @@ class SetInfo:
         require(fits, "metadata.json: obstacle_cell_size", rule, cell_size)
         require(len(set(self.materials.values())) <= 256, "materials", "at most 256", len(set(self.materials.values())))
         if self.gravity is not None:
-            rule = f"{self.dimensions} finite numbers, one for each axis of bounds, length per second squared"
-            there = len(self.gravity) == self.dimensions and bool(np.isfinite(self.gravity).all())
+            rule = f"{self.dimensions} finite numbers, one for each axis of bounds, at most {LARGEST:g}"
+            there = len(self.gravity) == self.dimensions and bool((np.abs(self.gravity) <= LARGEST).all())
             require(there, "gravity", rule, list(self.gravity))
 
     def obstacles(self, type_N: np.ndarray) -> np.ndarray:
