@@ -197,7 +197,7 @@ def test_experiments_without_a_package(tmp_path, command, head):
 
 @pytest.mark.parametrize("name", ["yes", "2024", "1e3", "null", "[a]", "{a: 1}", "''"])
 def test_names_of_trainings(tmp_path, command, name):
-    """What YAML does not read as text is no name of a folder."""
+    """A name that YAML does not read as text is refused as the name of a folder."""
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(f"{HEAD}name: {name}\n")
     given = (f"--config-dir={tmp_path}", "experiment=mine", "training.devices=0")  # refused after the name
@@ -291,7 +291,7 @@ def test_the_end_of_a_command():
 
 
 def test_other_broken_pipes_are_faults(monkeypatch):
-    """Of a process or a server that the command talks to: nothing is hidden."""
+    """Broken pipes to a process or a server of the command are errors and are reported."""
 
     def talks(mapping):
         raise BrokenPipeError("the server")

@@ -153,6 +153,6 @@ RULES = {
     ("settings", "options", "message"), [(settings, *rule) for settings, rules in RULES.items() for rule in rules]
 )
 def test_what_breaks_a_rule_is_named(settings, options, message):
-    """In settings and in options of commands: values alone, and values that contradict each other."""
+    """Errors name single values, and values that contradict each other, in settings and in options of commands."""
     with pytest.raises(ConfigError, match=message):
         settings(**options)

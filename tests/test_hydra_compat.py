@@ -1,4 +1,4 @@
-"""What hgn.hydra_compat takes for granted of Hydra."""
+"""Tests the assumptions of hgn.hydra_compat about Hydra."""
 
 import pytest
 

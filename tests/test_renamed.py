@@ -36,7 +36,7 @@ ANSWERS = [
 
 @pytest.mark.parametrize(("key", "value", "message"), ANSWERS)
 def test_removed_settings_are_named(key, value, message, removed):
-    """A removed setting is refused in one line with its fixed value, or what it follows from."""
+    """A removed setting is refused in one line with its fixed value, or with the setting that determines it."""
     section, _, name = key.partition(".")
     with pytest.raises(ConfigError, match=message) as caught:
         from_mapping(TrainConfig, {section: {name: value}})
@@ -111,8 +111,8 @@ def test_networks_of_before():
 
 
 def test_identity_keeps_its_names(monkeypatch, removed):
-    """A data set is identified by the keys that it was generated with, whatever they are called today or whether they
-    are settings any more."""
+    """The identity of a data set has the keys with which it was generated, whatever their present names, even if they
+    are no settings any more."""
     config = replace(DatagenConfig(), scene=SceneConfig(obstacle_count=3))
     before = dataset_identity(config)
     assert before["mpm"]["swirl"] == 0.5

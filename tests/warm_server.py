@@ -70,7 +70,7 @@ class WarmServer:
 
 
 def serve(listener):
-    """Forks for each request; returns a request in the child alone."""
+    """Forks for each request. Returns a request only in the child."""
     wake_read, wake_write = os.pipe()
     os.set_blocking(wake_write, False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -128,7 +128,7 @@ def enter_network(path):
 
 
 def run(request):
-    """What the interpreter does with its arguments."""
+    """Runs a program as the interpreter does with these arguments."""
     for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)

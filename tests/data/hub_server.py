@@ -17,7 +17,8 @@ TOKEN = "hf_of_the_test"
 
 
 class Hub(http.server.ThreadingHTTPServer):
-    """`failures` answers of those to come are errors of a server that is overloaded; `asked` are the paths."""
+    """Serves repositories. `failures` is the number of next answers that are errors of an overloaded server. `asked`
+    contains the requested paths."""
 
     def __init__(self, folder):
         super().__init__(("127.0.0.1", 0), _Handler)

@@ -76,7 +76,7 @@ def build_obstacle_grid(obstacles, cell_size, seed, domain_size):
 
 
 class Unreadable:
-    """More than a pipe holds, which nobody can read."""
+    """An object larger than a pipe's buffer that cannot be unpickled."""
 
     def __init__(self):
         self.content = bytes(1_000_000)

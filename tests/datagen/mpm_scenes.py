@@ -1,4 +1,4 @@
-"""What the solver's tests simulate, on a grid of 16 cells a side; the solver is loaded by those alone who simulate."""
+"""Defines the scenes of the solver's tests, on a grid of 16 cells a side. Only tests that simulate load the solver."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The field of distances around obstacles: what a network with obstacle_distance sees of surfaces."""
+"""Tests the field of distances around obstacles, the input of networks with obstacle_distance."""
 
 import weakref
 from dataclasses import replace

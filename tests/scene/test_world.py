@@ -160,7 +160,7 @@ def test_the_fastest_scene():
 
 
 def test_a_kind_that_fits_into_no_domain_is_refused():
-    """The kind is named, and what to change."""
+    """The message names the kind and the setting to change."""
     with pytest.raises(ConfigError, match=r"kinds must fit .* got jet; raise domain_size or leave"):
         generate_scene(SceneConfig(domain_size=(0.4, 1.0, 0.4), kinds={"jet": 1.0}), 0)
 

@@ -28,7 +28,7 @@ from hgn.training.precompile import launches_of, main, sizes_of
 
 
 def tell(self, key, signature, device, constants, options, attributes, **_):
-    """Stands for JITFunction._do_compile."""
+    """Replaces JITFunction._do_compile."""
     print(f"{self.__name__} {ASTSource(self, signature, constants, attributes).hash()} {options.hash()}")
     return SimpleNamespace(src=None, metadata=None)
 
@@ -63,7 +63,7 @@ assert printed.getvalue() == "1\n"
 
 # before a frame is captured all its kernels are compiled, two at a time; a launch would fail, as these have no launcher
 def captured(parts, warm_up):
-    """Stands for hgn.kernels.capture.captured."""
+    """Replaces hgn.kernels.capture.captured."""
     with noted_launches() as missing:
         for launches in (warm_up, *parts):
             launches()
@@ -72,7 +72,7 @@ def captured(parts, warm_up):
 
 
 def compiled(src, *_, **options):
-    """Stands for triton.compile."""
+    """Replaces triton.compile."""
     compiling.append(src.fn.__name__)
     if len(compiling) <= 2:
         both.wait()

@@ -20,7 +20,7 @@ TRAINING = {
 
 
 def train_mapping(config, run, **training):
-    """What Hydra would hand to the command."""
+    """Returns the mapping that Hydra would give to the command."""
     return to_mapping(config) | {
         "network": dict(NETWORK),
         "training": TRAINING | training,

@@ -1,4 +1,4 @@
-"""However the samples come to the trainer, whole or in windows, from a folder or a URL, the numbers are the same."""
+"""Tests that samples are the same whether they are read whole or in windows, from a folder or a URL."""
 
 import threading
 from dataclasses import replace
@@ -34,8 +34,8 @@ def episodes_of(folder, training, **options):
 
 @pytest.mark.parametrize(("importance", "quiet"), [(0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0)])
 def test_resident_feeding_equals_streaming(folder, importance, quiet):
-    """Whole episodes, which stay in a GPU's memory, hold the windows that streaming reads, bitwise, for samples of the
-    same order, seeds and weights; each episode comes once, and the cursors agree wherever a chunk ends."""
+    """Whole episodes in a GPU's memory contain bitwise the same windows as streaming, for samples with the same order,
+    seeds and weights. Each episode is sent once, and the cursors agree at the end of every chunk."""
     changes = {"frame_importance": importance, "quiet_acceleration": quiet}  # nothing accelerates as much
     network, training = SETTINGS[0], replace(SETTINGS[1], **changes)
     expected = list(islice(windows_of(folder, training).chunks(), UPDATES))
@@ -65,8 +65,8 @@ def test_resident_feeding_equals_streaming(folder, importance, quiet):
 
 
 def test_shard_made_again_is_not_mixed_up(make_config, make_dataset, folder):
-    """A damaged shard that was deleted and made again is published last: an epoch that began before does not go on,
-    for some samples would come twice."""
+    """A damaged shard that was deleted and made again is published last. An epoch that began before does not resume,
+    because some samples would be used twice."""
     *_, last = islice(windows_of(folder).chunks(), 3)
     (folder / "train-000001-000002.tar").unlink()
     make_dataset(make_config())

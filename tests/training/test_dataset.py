@@ -1,4 +1,4 @@
-"""The data set of a training: what its scenes take, what is missing, progress, and several data sets."""
+"""Tests the data set of a training: cost of its scenes, missing scenes, progress, and several data sets."""
 
 from unittest import mock
 
@@ -46,7 +46,8 @@ def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path,
 
 
 def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monkeypatch, capsys):
-    """The first scenes tell time and space of all, the first updates the time of all; on a CPU there is a way out."""
+    """The first scenes determine the estimates of time and space for all, and the first updates that of the training's
+    time. On a CPU the message names faster ways."""
     config = make_config()
     make_dataset(config)
     frames = config.dataset.frames
@@ -120,7 +121,7 @@ def test_manifest_is_read_once_for_missing_scenes(data, run, monkeypatch, genera
 
 
 def test_missing_data_without_generator(make_config, run):
-    """Without data and with generate=false the message says how to make some."""
+    """Without data and with generate=false the message explains how to make some."""
     with pytest.raises(ConfigError, match="generate it with python -m datagen"):
         train.main(train_mapping(make_config(), run))
 

@@ -56,7 +56,7 @@ def torchrun(folder, *options, python, prefix=(), **variables):
 
 
 def output(process):
-    """Returns the output of a process up to its end, which must come in time."""
+    """Returns the output of a process up to its end, which must come within a time limit."""
     try:
         return process.communicate(timeout=PATIENCE_S)[0]
     except subprocess.TimeoutExpired:
@@ -76,7 +76,7 @@ class Reference:
     gradients: dict[str, torch.Tensor]
 
     def folder(self, path, faults):
-        """A folder for ddp_program.py: 40 updates of two ranks with a scene each, and what befalls them."""
+        """Returns a folder for ddp_program.py: 40 updates of two ranks with a scene each, and their faults."""
         path.mkdir()
         (path / "mapping.json").write_text(json.dumps(self.mapping(path)))
         (path / "faults.json").write_text(json.dumps(faults))
@@ -304,7 +304,7 @@ def test_launcher_and_configuration_agree(no_launcher, variables, expected):
 
 
 def test_devices_that_are_not_there(no_launcher):
-    """All GPUs are taken unless fewer are asked for; more than there are, or a GPU where there is none, is refused."""
+    """By default all GPUs are used. More GPUs than there are, or a GPU on a machine without one, are refused."""
     for gpus in (0, 4):
         no_launcher.setattr(torch.cuda, "is_available", lambda gpus=gpus: gpus > 0)
         no_launcher.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
@@ -408,7 +408,7 @@ def test_variables_of_the_recorder_that_the_user_set_stay(monkeypatch, tmp_path)
 
 
 def test_signals_before_ranks_have_met(data, no_launcher, warm_python, tmp_path):
-    """A rank whose others never come ends on each signal that ends a training, instead of waiting for a time-out."""
+    """A rank that waits for others ends on each signal that ends a training, without waiting for a time-out."""
     processes = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
         folder, port = tmp_path / number.name, free_port()

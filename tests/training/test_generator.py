@@ -98,9 +98,9 @@ def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch, ca
 
 
 def test_waits_for_a_validation_scene(make_config, make_dataset, monkeypatch):
-    """While its generator runs, a training starts with a validation scene: a short one might end before there is one,
-    without best.ckpt. It starts without one if none is wanted or nothing makes one. A generator may make the last
-    scene and end just after a look."""
+    """While its generator runs, a training waits for a validation scene: a short training might end without one, and
+    without best.ckpt. It does not wait if no scene is requested or nothing makes one. A generator may make the last
+    scene and end just after a check."""
     config, looks = make_config(validation_scenes=1, test_scenes=0), []
     few = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     make_dataset(few)

@@ -1,4 +1,4 @@
-"""What hgn.training.lightning_compat takes for granted of Lightning."""
+"""Tests the assumptions of hgn.training.lightning_compat about Lightning."""
 
 import logging
 

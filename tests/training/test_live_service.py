@@ -40,7 +40,7 @@ class Service:
             self.process = start_module("ballistic_service", *overrides, stdout=log, stderr=log)
 
     def kill(self):
-        """Ends the service and all processes below it at once."""
+        """Kills the service together with all its child processes."""
         if self.process is not None:
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()

@@ -18,7 +18,7 @@ from hgn.training import loggers
 
 
 class Remembered(Logger):
-    """Keeps what it is given; each method named in `faults` fails."""
+    """Records its calls. Each method named in `faults` fails."""
 
     def __init__(self, faults=()):
         self.faults = faults

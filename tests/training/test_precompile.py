@@ -1,4 +1,4 @@
-"""Kernels compiled ahead: processes that compile, what the user hears of them, and that the cache then has it all."""
+"""Tests precompilation: its processes, its messages to the user, and the completeness of the cache."""
 
 import json
 import re

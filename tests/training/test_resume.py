@@ -1,4 +1,4 @@
-"""Order and resume: each sample once an epoch, and an interruption anywhere changes nothing."""
+"""Tests order and resuming: each sample is used once an epoch, and an interruption at any point changes nothing."""
 
 import dataclasses
 import signal
@@ -96,7 +96,7 @@ def test_an_epoch_keeps_the_revision_it_began_with(growth, world_size, starts):
 
 
 class Shared:
-    """What a feed asks of the trainer of one rank of several, when all see the same data set."""
+    """Replaces the trainer of one rank of several, if all ranks see the same data set."""
 
     def __init__(self, rank, world_size):
         self.global_rank, self.world_size, self.strategy = rank, world_size, self
@@ -259,7 +259,7 @@ def test_a_signal_ends_simulations_before_an_update(data, tmp_path, monkeypatch,
 
 
 def test_ranks_stop_before_the_next_update_after_a_stopped_measurement():
-    """Otherwise the checkpoint would be of a later update, and the measurement would be lost."""
+    """After another update the checkpoint would be later than the measurement, which would be lost."""
     stop, trainer = StopRequest(), mock.Mock(world_size=2, should_stop=False)
     trainer.strategy.reduce = lambda mine, reduce_op: mine
     stop.signal = signal.SIGTERM

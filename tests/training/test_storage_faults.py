@@ -1,4 +1,4 @@
-"""Momentary faults of the storage of a data set: readers of a training keep what they know, and ask again."""
+"""Tests temporary faults of a data set's storage: readers of a training keep their episodes and retry."""
 
 import contextlib
 import errno
@@ -74,7 +74,7 @@ def renamed(name):
 
 
 def older(before):
-    """A manifest with none of the shards."""
+    """Returns a manifest without any shards."""
     head = json.loads(before)
     empty = {"shards": 0, "episodes": 0, "bytes": 0, "digest": "", "statistics": None}
     index = {"generation": head["index"]["generation"]}
@@ -118,8 +118,8 @@ def faulty(folder, name):
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_manifest_that_is_away_for_a_moment(data, name, capsys, monkeypatch):
-    """The episodes stay, one line reports it, and the next look finds the manifest; after the patience it is an error,
-    whose remedy is not to delete the manifest. Outside a training it is an error at once."""
+    """The episodes stay, one line reports the fault, and the next refresh finds the manifest. After the patience it is
+    an error, whose remedy is not to delete the manifest. Outside a training it is an error immediately."""
     store = EpisodeStore(data.dataset.folder, "train")
     with faulty(data.dataset.folder, name), pytest.raises((ConfigError, OSError)):
         store.refresh()
@@ -291,7 +291,7 @@ def test_faults_while_a_training_waits_for_episodes(data, tmp_path, monkeypatch,
 
 
 def test_a_folder_of_a_run_that_fails_for_a_moment(data, tmp_path, monkeypatch):
-    """Checkpoints, pictures and log lines that cannot be written are written later, each once."""
+    """Checkpoints, pictures and log lines that cannot be written are written later, each of them once."""
     for place, name in ((checkpoint_writer, "_write"), (callbacks, "_drop_cut_line"), (monitor, "write_pictures")):
         monkeypatch.setattr(place, name, failing_at_first(getattr(place, name)))
     assert train.main(train_mapping(data, tmp_path / "run", monitor_every=100, monitor_rollout_frames=2)) == 0
@@ -307,8 +307,8 @@ def test_writes_wait_while_readers_end(tmp_path):
 
 
 def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
-    """A manifest that breaks as the training starts does not end it. Without patience the training ends with an error,
-    and with a checkpoint of its last update, from which it goes on."""
+    """A damaged manifest at the start does not end a training. Without patience the training ends with an error and a
+    checkpoint of its last update, from which it resumes."""
     started, run, again, calls = hgn.training.session.train_network, tmp_path / "run", EpisodeStore.ask_again, []
 
     def later(store):
@@ -336,7 +336,7 @@ def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("every", [{"log_every": 3, "checkpoint_every": 100}, {"checkpoint_every": 2}])
 def test_a_run_whose_folder_is_deleted(data, tmp_path, monkeypatch, every):
-    """The folder is made again and locked again, and the training goes on."""
+    """The folder is created and locked again, and the training continues."""
     run, before, refused = tmp_path / "run", callbacks.LogLines.on_train_batch_end, []
 
     def deleting(lines, trainer, module, *rest):
@@ -359,7 +359,7 @@ def test_a_run_whose_folder_is_deleted(data, tmp_path, monkeypatch, every):
 
 @pytest.mark.parametrize("every", [{"log_every": 3, "checkpoint_every": 100}, {"checkpoint_every": 2}])
 def test_a_run_whose_folder_is_another_trainings(data, tmp_path, monkeypatch, every):
-    """Another training begins in the place of the deleted folder: the first one ends, and writes nothing there."""
+    """Another training starts in the place of the deleted folder. The first one ends, and writes nothing there."""
     run, before, other = tmp_path / "run", callbacks.LogLines.on_train_batch_end, []
 
     def deleting(lines, trainer, module, *rest):

@@ -107,7 +107,7 @@ def test_training_sees_the_image(network, shown):
 
 
 def test_a_particle_on_a_face_takes_the_cell_above_in_the_image():
-    """At 10 cells exactly, mirrored to 53, a particle sees what lies in the image's cell 53: the scene's cell 9."""
+    """At 10 cells exactly, mirrored to 53, a particle has the image's cell 53, which is the scene's cell 9."""
     (mirror,) = (s for s in EIGHT if s.source == (0, 1, 2) and s.mirrored == (True, False, False))
     cell = np.array([[9, 5, 5], [10, 5, 5]], np.int32)
     normal = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32)

@@ -133,8 +133,8 @@ def test_the_end_of_a_diverged_run_is_reported(make_config, run, capsys):
 
 
 def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
-    """One NaN in a gradient leaves parameters and moments bitwise as they were, is counted, and the training goes on.
-    At the limit of updates skipped in a row it ends with a message, and the stored parameters are finite."""
+    """One NaN in a gradient leaves parameters and moments bitwise unchanged and is counted, and the training continues.
+    At the limit of skipped updates in a row it ends with a message, and the stored parameters are finite."""
     before: dict[int, dict[str, torch.Tensor]] = {}
     original = TorchUpdates.run
 
@@ -186,7 +186,7 @@ def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, capsys, 
 
 
 def test_a_second_interrupt_does_not_wait(finished, monkeypatch):
-    """Ctrl-C twice within an update leaves at once, and as every command does, by an interrupt."""
+    """Two Ctrl-C within an update end the command immediately, by an interrupt as in every command."""
     data, run = finished
 
     def signalled(updates, update):
@@ -201,8 +201,8 @@ def test_a_second_interrupt_does_not_wait(finished, monkeypatch):
 
 @pytest.mark.parametrize("updates", [12, 5])
 def test_a_finished_run_stays_finished(finished, capsys, updates):
-    """Starting a finished run again, also with fewer updates, changes no file of its results and reports what continues
-    it; incomplete files of a crash are removed. While another training is in the run it is refused."""
+    """A second start of a finished run, also with fewer updates, changes none of its results and prints how to continue
+    it. Incomplete files of a crash are removed. While another training uses the run, a start is refused."""
     data, run = finished
     kept = [run / "metrics.jsonl", *sorted((run / "checkpoints").iterdir())]
     before = [path.read_bytes() for path in kept]
@@ -217,8 +217,8 @@ def test_a_finished_run_stays_finished(finished, capsys, updates):
 
 
 def test_the_best_network_is_remembered(data, run, monkeypatch):
-    """What is measured at the very end, after a checkpoint of the same update, is the bound that a later start has to
-    beat; so `best.ckpt` is never replaced by a worse one. A GPU that training.device=cpu leaves alone is no warning."""
+    """A measurement at the end, after a checkpoint of the same update, is the bound for later starts, so that
+    `best.ckpt` is never replaced by a worse one. An unused GPU with training.device=cpu causes no warning."""
     monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
     assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=1000)) == 0
     (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)

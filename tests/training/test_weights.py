@@ -129,8 +129,8 @@ def test_other_constraints_are_taken(tmp_path):
 
 @pytest.mark.parametrize("updates", [1, 4, 60, 100, 1499, 1500, 75_000])
 def test_warm_up(updates):
-    """The rate grows linearly over the first updates, at most a fifth of all, to what it is without warm-up, and is the
-    same from there: a warm-up of 300 updates does not keep the rate of 100 updates below a tenth of it."""
+    """The rate grows linearly over the first updates, at most a fifth of all, and then equals the rate without warm-up.
+    A warm-up of 300 updates does not keep the rate of 100 updates below a tenth of it."""
     values = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "maximum_updates": updates}
     warm, cold = (TrainingConfig(**values, warmup_updates=n) for n in (300, 0))
     factors = [learning_rate(warm, update) / learning_rate(cold, update) for update in range(min(updates, 400))]
@@ -142,7 +142,7 @@ def test_warm_up(updates):
 
 @pytest.mark.parametrize(("name", "kind"), [("adam", torch.optim.Adam), ("muon", Muon)])
 def test_the_optimiser_is_the_configured_one(name, kind):
-    """Both are fused, which alone can skip a step by themselves."""
+    """Both optimisers are fused, because only fused ones can skip a step themselves."""
     optimizer = build_optimizer(build_network(NetworkConfig(**NETWORK)), TrainingConfig(optimizer=name))
     assert type(optimizer) is kind and optimizer.param_groups[0]["fused"]
 
@@ -191,7 +191,7 @@ def test_an_export_sets_rest_walls_and_obstacles(finished, tmp_path):
 
 
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):
-    """The average follows its definition over every update; the export holds it, and monitoring measures it."""
+    """The average follows its definition over all updates. It is exported and monitored."""
     seen: list[dict[str, torch.Tensor]] = []
     original = TorchUpdates.step
 

@@ -60,7 +60,7 @@ def floating():
 
 
 def without_shadows(server):
-    """Nor reflections: a browser without a GPU spends most of its time on them. Returns the server."""
+    """Disables shadows and reflections, which are slow in a browser without a GPU. Returns the server."""
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.configure_environment_map(hdri=None)
     return server
@@ -284,7 +284,8 @@ def test_scene_and_rollout_are_taken_away(viewer, play, tmp_path):
 
 
 def test_own_meshes(viewer, play):
-    """An uploaded mesh stands free of particles, as large as the slider says; what is none is told."""
+    """An uploaded mesh is placed without particles inside, with the size of the slider. A file that is no mesh causes a
+    message."""
     count = len(play.session.obstacles)
     field = viewer.locator("input[type=file]")
     field.set_input_files(files=[{"name": "a.obj", "mimeType": "", "buffer": b"no mesh"}])

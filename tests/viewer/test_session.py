@@ -116,8 +116,8 @@ def test_keyframes_are_refused(folder):
 
 
 def test_a_dragged_obstacle_carries_particles_along(session):
-    """With weights that see motion a plate that is dragged up lifts particles by its displacement in a frame, and rests
-    afterwards; a jump has no velocity."""
+    """With weights that use moving obstacles a plate that is dragged up lifts particles by its displacement in a frame,
+    and rests afterwards. A jump has no velocity."""
     session.use_weights(free_flight(obstacle_clearance=1e-3, own_physics=("moving",)))
     for obstacle in session.obstacles:
         session.remove_obstacle(obstacle.body.number)
@@ -208,8 +208,8 @@ def load_count(session):
 
 
 def test_changes_are_undone_one_by_one(session):
-    """Undo goes back to frame, obstacles and gravity before the last change, twice for two changes in one frame; a
-    change after the frame that somebody went back to does not count."""
+    """Undo restores frame, obstacles and gravity before the last change, twice for two changes in one frame. Changes
+    after a frame to which the scene was rewound are dropped."""
     steps(session, 3)
     then, before = session.newest.position_N3.copy(), session.obstacles
     session.remember()
@@ -297,8 +297,8 @@ def test_the_scene_is_saved(session, tmp_path):
 
 @pytest.mark.parametrize("frames", [0, 3])
 def test_friction_constants_and_velocities_are_saved(folder, frames):
-    """The saved scene has both frictions, the constants of each particle, none of poured ones, and velocities at the
-    instant of the frame, from which a simulation starts with the displacements that the particles had."""
+    """The saved scene contains both frictions, the constants of each particle (none for poured ones), and velocities at
+    the instant of the frame, from which a simulation starts with the particles' displacements."""
     cubes = [
         "material: sand, sand_friction_angle_deg: 40.1, density_kg_m3: 900",
         "material: water, water_viscosity_pa_s: 3, velocity: [0.1, 0.2, 0.3]",

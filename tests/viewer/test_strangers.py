@@ -33,7 +33,7 @@ TRIANGLES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2
 
 
 def sent(page, action):
-    """Does what a viewer sent, as the page's loop would."""
+    """Runs a viewer's actions, as the page's loop does."""
     page.do(action)
     page._do_all()
     page._show()
@@ -57,7 +57,7 @@ def test_names_of_weights_are_shown_as_plain_words(page, monkeypatch, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_names_of_files_are_shown_as_plain_words(page, messages, name):
-    """Whatever a file is called, the page shows letters, digits, dots, hyphens and underscores."""
+    """For any name of a file the page shows only letters, digits, dots, hyphens and underscores."""
     sent(page, lambda: page._add_file(name, TRIANGLES))
     assert re.fullmatch(r"chosen: [A-Za-z0-9_.-]{1,48}", page.chosen_text.content)
     assert not messages
@@ -85,7 +85,7 @@ def moved(**place):
 
 
 def sheets(count):
-    """Squares above one another, which need the samples of as many surfaces."""
+    """Returns squares above one another, which need the samples of this number of surfaces."""
     corners = "".join(f"v 0 {i} 0\nv {count} {i} 0\nv {count} {i} {count}\nv 0 {i} {count}\n" for i in range(count))
     return (corners + "".join(f"f {4 * i + 1} {4 * i + 2} {4 * i + 3} {4 * i + 4}\n" for i in range(count))).encode()
 
@@ -149,7 +149,7 @@ def test_a_drag_that_reaches_the_limit_is_told_once(page, messages, monkeypatch)
 
 @pytest.mark.parametrize("error", [KeyError("x"), ZeroDivisionError("x"), RuntimeError("x"), MemoryError("x")])
 def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, capsys, error):
-    """An unexpected error is told to its viewer and printed with its trace; no other action is lost."""
+    """An unexpected error is shown to its viewer and printed with its traceback. All other actions run."""
 
     def fail():
         raise type(error)("x")  # `error` would keep its trace, and with it the frames' values
@@ -190,7 +190,7 @@ def test_values_beyond_the_sliders_are_clamped(page, monkeypatch):
 
 
 def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
-    """Moving an obstacle 30 times keeps no more states alive than moving it once, and no samples of past places."""
+    """After 30 moves of an obstacle no more states exist than after one, and no samples of past places."""
     session = page.session
     alive: list[weakref.ref] = []
     begin = InitialState.__init__
@@ -211,8 +211,8 @@ def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
 
 
 def test_requests_of_other_pages_are_refused():
-    """A page of another origin is refused even with the token, and so are tokens that no browser sends. Nothing that a
-    browser sends to other ports of the host opens the page."""
+    """A page of another origin is refused even with the token, and so are paths that only contain the token elsewhere.
+    Cookies, which a browser sends to all ports of the host, do not open the page."""
     own = ("http://127.0.0.1:8080", "HTTP://127.0.0.1:8080", "https://127.0.0.1:8080")  # the last by a tunnel with TLS
     others = ("http://127.0.0.1:9999", "http://evil.example", "null", "", "http://[::1", "http://a]b", "file://")
     others += ("http://127.0.0.1:8080@evil.example", "http://u@127.0.0.1:8080", "javascript://127.0.0.1:8080")

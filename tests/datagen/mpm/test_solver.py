@@ -86,9 +86,9 @@ def test_materials_a_thousand_times_as_stiff_beside_each_other():
 
 
 def test_scenes_of_a_batch_equal_scenes_alone():
-    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles, domain and
-    steps; water's also with a kernel for water only, on two threads. In its small domain it meets the far wall.
-    """
+    """A scene's trajectory is bitwise the same alone and in a batch with scenes of other size, material, obstacles,
+    domain and steps. For water this also holds with a kernel for water only, on two threads. In its small domain it
+    reaches the far wall."""
     water = block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (4, -3, 0))
     water = dataclasses.replace(water, domain_size=(14 * CELL, 26 * CELL, 20 * CELL))
     snow = block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet(0.3),))

@@ -87,8 +87,8 @@ MOVING = lifted(sheet(0.3), shape_obstacle("pyramid", 0.2, (0.4, 0.15, 0.4)))
     ids=["each step is an interval", "two blocks", "moving obstacles"],
 )
 def test_other_kernels_agree(config, scenes, team, tolerance):
-    """Kernels without steps of particles' own, and scenes of two blocks that wait for each other, beside one that
-    fails, end where one launch a substep does: a frame agrees to 1e-6, as many substeps are taken."""
+    """Kernels without separate steps of particles, and scenes of two blocks that wait for each other, next to one that
+    fails, agree with one launch per substep: a frame to 1e-6, with equal numbers of substeps."""
     for one, other in zip(*(simulate(scenes, config, 4, 60.0, team=each) for each in (Team(0), team)), strict=True):
         if isinstance(one, SceneFailure):
             assert one == other and scenes[2:] == [FAILING]
@@ -141,9 +141,8 @@ def test_teams_are_larger_where_few_scenes_have_most_of_the_work():
 
 
 def test_blocks_that_are_not_at_work_at_once(monkeypatch):
-    """Three blocks on two threads, that would wait for ever: all leave, a warning says so, and each substep is a launch
-    of its own, with the same result.
-    """
+    """Three blocks on two threads would wait for ever. All of them end, a warning reports it, and each substep becomes
+    a launch, with the same result."""
     monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
     monkeypatch.setattr(team_launch, "PATIENCE", (10_000, 10_000))
     scenes = [mixed(120, 0, (0, -3, 0)), HEAVY]

@@ -40,9 +40,8 @@ def run(scene, config, frames, rate_hz=60.0):
 
 
 def test_stiffness_changes_steps_and_not_transfers():
-    """Slow scenes take cell_size / transfer_speed_m_s between transfers, eight times a frame here, however many steps
-    of stress they need; fast ones transfer more often, so that nothing goes further than a part of a cell.
-    """
+    """Slow scenes have cell_size / transfer_speed_m_s between transfers, eight times a frame here, with any number of
+    stress steps. Fast scenes transfer more often, so that no particle moves farther than a fraction of a cell."""
     soft, hard, fast = (
         run(cube(velocity, stiffness), CONFIG, 3)
         for velocity, stiffness in (((0, -1, 0), 1), ((0, -1, 0), 30), ((12, -12, 0), 1))
@@ -139,9 +138,8 @@ def test_what_is_stiff_rests():
 
 
 def test_sand_rests_around_what_is_stiff():
-    """Sand in a bin with a stiff body in its middle lies still, though its steps are longer than the body's: its centre
-    sinks by less than 0.02 cells in 0.2 s (it rose by 0.2, for what acts at once is seen before the rest balances it).
-    """
+    """Sand in a bin around a stiff body stays at rest, although its steps are longer than the body's: its centre sinks
+    by less than 0.02 cells in 0.2 s. (It once rose by 0.2, because one force acted before the others balanced it.)"""
     sand = block(SAND, (2, 2, 2), (4, 6, 4))
     inside = ((64 * sand.position_N3 > (3, 4, 3)) & (64 * sand.position_N3 < (5, 6, 5))).all(1)
     sand = dataclasses.replace(
