@@ -25,6 +25,7 @@ PULL = 0.1  # fraction of the position error that a target removes
 SHAPE_PULL = 0.5  # fraction of an elastic body's deformation that a target removes
 LIMIT = 0.5  # position errors are clamped to this on each axis, in finest cells
 SMALLEST = 1e-4  # least mean square offset of neighbours in a gradient, in finest cells squared
+TOGETHER = 2**18  # particles of all frames of which moments are in memory at a time
 ROWS, ENTRIES = 512, 2**25  # particles, and pairs of particles, that are computed together
 
 
@@ -47,7 +48,10 @@ def pushforward_windows(
     true_FN3, velocity_FN3 = true_TN3[history + 1 : -1].double(), true_TN3[history + 1 :].double().diff(dim=0)
     error_FN3 = true_FN3 - simulated_FN3
     near_FN3 = error_FN3.clamp(-LIMIT * cell_size, LIMIT * cell_size)
-    step_FN3 = moved_velocities(true_FN3, velocity_FN3, -near_FN3, material_N, cell_size=cell_size)
+    blocks = [x_FN3.split(max(1, TOGETHER // len(material_N))) for x_FN3 in (true_FN3, velocity_FN3, -near_FN3)]
+    step_FN3 = torch.cat(
+        [moved_velocities(x, v, offset, material_N, cell_size=cell_size) for x, v, offset in zip(*blocks, strict=True)]
+    )
     pull_FN3 = PULL * near_FN3
     for body_B in bodies:
         rigid_FB3 = rigidly_moved(true_FN3[:, body_B], simulated_FN3[:, body_B].double())

@@ -127,6 +127,7 @@ def test_materials_do_not_share_motion(monkeypatch):
         mine = materials == material
         (alone,) = targets(true[:, mine], simulated[None, mine])
         torch.testing.assert_close(both[mine], alone, rtol=0, atol=1e-12)
+    monkeypatch.setattr(pushforward_targets, "TOGETHER", 1)
     monkeypatch.setattr(pushforward_targets, "ROWS", 7)
     monkeypatch.setattr(pushforward_targets, "ENTRIES", 100)
     torch.testing.assert_close(targets(true, simulated[None], material_N=materials)[0], both, rtol=0, atol=1e-12)
