@@ -254,7 +254,7 @@ def test_types_without_a_name_in_own_materials_are_refused(types, tmp_path):
 
 
 def test_gravity_of_any_size(tmp_path):
-    """A gravity that is not compared with free flight by NumPy, which would warn."""
+    """Gravity beyond 1e15 is refused before it is compared with free flight, where NumPy would warn."""
     source = write(tmp_path / "foreign", "plain", {}, metadata(gravity=[0, -1e300, 0]))
     with pytest.raises(ConfigError, match=r"gravity must be 3 finite numbers.*, at most 1e\+15, got \[0.0, -1e\+300"):
         set_info(source, "plain", ImportConfig(out="mine"))

@@ -14,7 +14,7 @@ from hgn.scene.rollout_file import write_frames, write_rollout
 
 @pytest.fixture
 def no_file(monkeypatch):
-    """Replaces the file that is written by a pipe, which refuses to seek too; None: undoes it."""
+    """Puts a pipe in place of the written file, because a pipe also refuses to seek. None undoes this."""
     disks, ends = [], os.pipe()
     monkeypatch.setattr(rollout_file, "FileOnDisk", lambda path: disks.append(FileOnDisk(path)) or disks[-1])
 

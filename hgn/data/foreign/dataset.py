@@ -15,7 +15,7 @@ from hgn.data.foreign.episodes import Converter, obstacle_cell_size
 from hgn.data.foreign.formats import find_format, read_split, set_info
 from hgn.data.foreign.gravity import estimate_gravity
 from hgn.data.foreign.settings import ImportConfig
-from hgn.data.foreign.trajectory import USUAL_NEIGHBOURS, SetInfo, Trajectory, require_inside
+from hgn.data.foreign.trajectory import SetInfo, Trajectory, require_inside
 from hgn.data.identity import identity_hash
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
@@ -27,6 +27,8 @@ from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 SHARD_BYTES = 128 << 20  # a shard ends with the episode that reaches this size
 LOOKED_AT = 4  # number of trajectories that give estimates of gravity, neighbours and the boundary particles' spacing
+USUAL_NEIGHBOURS = 15  # published sets have about 10 to 20
+WIDEST = 100  # largest width of the box, in widths of the region that particles visit
 MOST_NEIGHBOURS = 1000  # mean number; this project's data, with 8 particles per solver cell, have at most 400
 
 
@@ -46,6 +48,8 @@ def import_set(
     require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
     for trajectory in first:
         require_inside(trajectory, info)
+    if config.bounds is None:
+        _require_narrow(first, info)
     gravity = _gravity(first, info, known=config.gravity is not None)
     neighbours = _neighbour_count(first, info)
     still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
@@ -87,6 +91,17 @@ def import_set(
     requested = {split: sum(len(shard.episodes) for shard in shards if shard.split == split) for split in SPLITS}
     manifest = Manifest(identity_hash(identity), identity, requested, len(shards)).save(out, shards)
     return manifest, neighbours, converter.note_on_bounds(sum(requested.values()))
+
+
+def _require_narrow(first: list[Trajectory], info: SetInfo) -> None:
+    """Raises ConfigError for bounds that are much wider than the paths of more than a few particles."""
+    paths = [t.position_TND.reshape(-1, info.dimensions) for t in first if t.position_TND.shape[1] > USUAL_NEIGHBOURS]
+    if not paths:
+        return
+    paths_D2 = np.stack([np.min([path.min(0) for path in paths], 0), np.max([path.max(0) for path in paths], 0)], -1)
+    fits = WIDEST * np.ptp(paths_D2, axis=1).max() >= np.ptp(info.bounds, axis=1).max()
+    rule, bounds = f"at most {WIDEST} times as wide as the particles' paths", [list(pair) for pair in info.bounds]
+    require(fits, "bounds", rule, bounds, f"paths are in {paths_D2.round(4).tolist()}; to use these, give bounds=…")
 
 
 def _gravity(first: list[Trajectory], info: SetInfo, known: bool) -> tuple[float, ...]:

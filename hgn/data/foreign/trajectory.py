@@ -19,8 +19,6 @@ MOVES = 20  # number of changed coordinates above which repeated values show rou
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
 MOST_CELLS = 1 << 16  # largest number of obstacle cells along an axis
 OUTSIDE = 0.01  # largest fraction of particles that may start more than a radius outside the box
-USUAL_NEIGHBOURS = 15  # published sets have about 10 to 20
-WIDEST = 100  # largest width of the box, in widths of the region that particles visit
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
 
@@ -157,24 +155,17 @@ def _step(position_TND: np.ndarray, radius: float) -> float:
 
 
 def require_inside(trajectory: Trajectory, info: SetInfo) -> None:
-    """Refuses trajectories without moving particles, and bounds of another unit: they must contain the particles of the
-    first frame, and be at most WIDEST times as wide as the paths of more than a few particles."""
+    """Refuses trajectories without moving particles, and bounds that do not contain those of the first frame."""
     free_N = ~info.obstacles(trajectory.type_N)
     rule = "of particles that are not obstacles"
     require(bool(free_N.any()), f"{trajectory.name}: position", rule, "none", "leave it out")
     place_ND = trajectory.position_TND[0, free_N].astype(np.float64)
     low_D, high_D = np.array(info.bounds).T
-    rule = f"at most {WIDEST} times as wide as the paths of the particles"
-    path_nD = trajectory.position_TND.reshape(-1, info.dimensions).astype(np.float64)
-    paths = np.stack([path_nD.min(0), path_nD.max(0)], -1)
-    fits = len(place_ND) <= USUAL_NEIGHBOURS or WIDEST * np.ptp(paths, axis=1).max() >= (high_D - low_D).max()
-    bounds = [list(pair) for pair in info.bounds]
-    require(fits, "bounds", rule, bounds, f"{trajectory.name} has them in {paths.round(4).tolist()}; give bounds=…")
     outside_N = ((place_ND < low_D - info.radius) | (place_ND > high_D + info.radius)).any(-1)
     if outside_N.sum() > OUTSIDE * len(place_ND):
         extent = np.stack([place_ND.min(0), place_ND.max(0)], -1).round(4).tolist()
         raise ConfigError(
-            f"bounds must contain the particles, got {bounds} with "
+            f"bounds must contain the particles, got {[list(pair) for pair in info.bounds]} with "
             f"{outside_N.mean():.0%} of {trajectory.name} outside, whose particles are in {extent}; give bounds=…"
         )
 
