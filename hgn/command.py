@@ -127,7 +127,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
         place = f": {error.filename}" if error.filename else ""
         text = f"{reason}{place}; {'choose another path' if wrong else remedy} and run the same command again"
-        if wrong and (setting := _setting_of(str(error.filename), mapping)):
+        if wrong and error.filename and (setting := _setting_of(str(error.filename), mapping)):
             text = f"{setting[0]} must be another path, got {setting[1]!r}: {reason}"
         code = EXIT_INPUT if wrong or _is_special(error.filename) else EXIT_MACHINE
         code = _fail(str(ConfigError(text)), code)  # ConfigError shortens the text
@@ -153,7 +153,7 @@ def _is_own_fault(error: OSError) -> bool:
 
 def _setting_of(path: str, mapping: Mapping[str, Any]) -> tuple[str, str] | None:
     """Returns key and value of the setting that names a path, or else the nearest folder above or below it."""
-    nearest, found = 0, None
+    nearest, found = (0, 0), None
     for key, value in mapping.items():
         given = value
         if isinstance(value, Mapping) and (inner := _setting_of(path, value)):
@@ -162,8 +162,9 @@ def _setting_of(path: str, mapping: Mapping[str, Any]) -> tuple[str, str] | None
             continue
         ends = [str(Path(end).resolve()) for end in (path, given)]
         common = os.path.commonpath(ends)
-        if common in ends and len(common) > nearest:
-            nearest, found = len(common), (key, given)
+        rank = (len(common), -len(ends[1]))
+        if common in ends and rank > nearest:
+            nearest, found = rank, (key, given)
     return found
 
 

@@ -1,5 +1,6 @@
 """Tests what all commands have in common: reading of settings and their files, and output."""
 
+import errno
 import io
 import os
 import subprocess
@@ -150,6 +151,7 @@ def test_pipes_and_devices_in_place_of_folders(tmp_path, command, monkeypatch, p
         ("file", os.listdir, "'file': Not a directory"),
         ("folder", Path.read_text, "'folder': Is a directory"),
         ("folder/../file/x", lambda path: make_folder(path.absolute()), "'folder/../file/x': "),
+        ("..", Path.read_text, "'..': Is a directory"),
     ],
 )
 def test_paths_of_another_kind(tmp_path, command, monkeypatch, value, write, seen):
@@ -161,6 +163,16 @@ def test_paths_of_another_kind(tmp_path, command, monkeypatch, value, write, see
     assert code == 2 and error.startswith(f"error: dataset.folder must be another path, got {seen}"), error
     code, _, error = command("train", main=lambda _: Path("file").mkdir())
     assert code == 2 and error == "error: File exists: file; choose another path and run the same command again\n"
+
+
+def test_paths_without_a_name(command):
+    """An error that has no path names no setting."""
+
+    def read(_):
+        raise IsADirectoryError(errno.EISDIR, "Is a directory")
+
+    code, _, error = command("train", "run=.", main=read)
+    assert code == 2 and error == "error: Is a directory; choose another path and run the same command again\n"
 
 
 @pytest.mark.parametrize(
