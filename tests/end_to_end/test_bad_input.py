@@ -184,7 +184,7 @@ FILES = [
     ("rollout", ROLLOUT, of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"), " inside obstacle_0_cone (particles: x 0.4"),
     ("rollout", ROLLOUT, MESH, "obstacles[0].mesh must"),
     ("evaluate", EVALUATE, of("damage", "validation", truncate), " bytes, got "),
-    ("evaluate", EVALUATE, of("damage", "validation", alter), ": it was altered; delete it and run the generator agai"),
+    ("evaluate", EVALUATE, of("damage", "validation", alter), ": it was altered; use an intact copy, or delete it and"),
     ("evaluate", EVALUATE, of("damage", "validation", Path.unlink), " is listed in the index but missing; run the gen"),
     ("train", "other", of("damage", "train", truncate), " bytes, got "),
     ("train", "run", CUT_RUN, "checkpoint must be a complete checkpoint file, got"),
