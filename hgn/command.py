@@ -153,17 +153,19 @@ def _is_own_fault(error: OSError) -> bool:
 
 def _setting_of(path: str, mapping: Mapping[str, Any]) -> tuple[str, str] | None:
     """Returns key and value of the setting that names a path, or else the nearest folder above or below it."""
-    nearest, found = (0, 0), None
+    here, nearest, found = str(Path(path).resolve()), 0, None
     for key, value in mapping.items():
         given = value
         if isinstance(value, Mapping) and (inner := _setting_of(path, value)):
             key, given = f"{key}.{inner[0]}", inner[1]
         if not isinstance(given, str) or not given:
             continue
-        ends = [str(Path(end).resolve()) for end in (path, given)]
-        common = os.path.commonpath(ends)
-        rank = (len(common), -len(ends[1]))
-        if common in ends and rank > nearest:
+        end = str(Path(given).resolve())
+        common = os.path.commonpath([here, end])
+        # any text is a path below the current folder, so only a setting that leads out of it is below a folder above
+        through = common == here and (Path(given).is_absolute() or not Path.cwd().is_relative_to(here) or end == here)
+        rank = len(common) + (through and end != here)
+        if (through or common == end) and rank > nearest:
             nearest, found = rank, (key, given)
     return found
 

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_593,
+    "hgn": 34_604,
     "datagen": 8_932,
     "tools": 6_295,
-    "tests": 35_997,
+    "tests": 36_007,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -81,6 +81,11 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         self.simulation.frame, self._numbers = frame, [frame] * len(self.scenes)
 
     @property
+    def frames(self) -> tuple[int, ...]:
+        """Returns the number of each scene's last frame. They differ after `restore` of one of several scenes."""
+        return tuple(self._numbers)
+
+    @property
     def state(self) -> ParticleState:
         """Returns the input of the network for the next frame, on the simulator's device; read-only."""
         return self.simulation.state if self._changed is None else self._changed
@@ -98,11 +103,12 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         if self._changed is not None:
             self.simulation.continue_from(self._changed)
             self._changed = None
+        before = self.frame
         try:
             for _ in self.simulation.blocks(1):
                 pass
         finally:
-            self.frame = self.simulation.frame
+            self._numbers = [number + self.frame - before for number in self._numbers]
         self.ended |= self.simulation.ended
         return self.state
 
@@ -189,12 +195,15 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         Gravity and obstacles stay, but moving obstacles jump to their poses in that frame. Keyframes continue,
         without the moves made since. `frame` becomes the number of the last frame.
 
-        position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first.
+        position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first. frame: the
+        scene's number in `frames` at that time.
+        Raises: ConfigError for a later frame.
         """
         self._require_scene(index)
-        state = self.state
+        state, number = self.state, self._numbers[index]
         mine_N = state.scene_N == index
         require_count("frame", frame, 0)
+        require(frame <= number, "frame", f"at most {number}, the scene's last frame", frame)
         count = len(_array("position_N3", position_N3, (None, 3)))
         _array("velocity_NM3", velocity_NM3, (count, *state.velocity_NM3.shape[1:]))
         most = int(mine_N.sum())
@@ -207,7 +216,7 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         )
         if state.moving is not None:
             frames = [*state.moving.frames]
-            frames[index] = max(0, frames[index] + frame - self._numbers[index])
+            frames[index] = max(0, frames[index] + frame - number)
             own, moves = self.scenes[index].moving, self._before_moves[index]
             while moves and moves[-1][0] >= frames[index]:
                 own = moves.pop()[1]

@@ -340,9 +340,9 @@ class PlaySession:
         except ConfigError:  # a material of added particles
             live.close()
             raise
+        live.frame = self.frame
         if live.state.velocity_NM3.shape[1] == history_NM3.shape[1]:
             live.restore(newest.position_N3, history_NM3, self.frame)
-        live.frame = self.frame
         self.recording.enter(np.zeros(0, np.uint8), live.state.velocity_NM3[:0].cpu().numpy())
         self.live.close()
         self.live, self.simulator, self.weights = live, simulator, weights

@@ -302,6 +302,16 @@ def test_restored_obstacles_are_where_they_were():
         for frame in (8, 6, 2):
             restore(frame)
             np.testing.assert_array_equal(steps(frame), path_TN3[frame:])
+        for index in (0, 1):  # a scene restored later than the other one
+            then = states[5]
+            rows = then.scene_N == index
+            live.restore(then.position_N3[rows].numpy(), then.velocity_NM3[rows].numpy(), 5, index)
+            again = steps(5)
+            np.testing.assert_array_equal(again[:, rows], path_TN3[5:, rows])
+        assert live.frames == (15, 10) and live.frame == 10
+        with pytest.raises(ConfigError, match="frame must be at most 10, the scene's last frame, got 11"):
+            live.restore(then.position_N3[rows].numpy(), then.velocity_NM3[rows].numpy(), 11, 1)
+        live.frame = frames
         restore(6)
         place_V3 = states[6].moving.poses.place_V3
         torch.testing.assert_close(live.state.moving.poses.place_V3, place_V3, rtol=0, atol=0)
