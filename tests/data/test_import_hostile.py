@@ -155,7 +155,7 @@ def pickled(content):
         ("deepmind", meta(dt="soon"), r"metadata.json: dt must be a finite number, got 'soon'"),
         ("deepmind", meta(dim=2.5), r"metadata.json: dim must be 2 or 3, got 2.5"),
         ("deepmind", meta(bounds=[[0, 1], [0, 1], [0, float("inf")]]), r"bounds must be finite numbers in pairs"),
-        ("deepmind", meta(default_connectivity_radius=1e-12), r"radius must be at least 6.1e-05 for a box of width 1"),
+        ("deepmind", meta(default_connectivity_radius=1e-12), r"radius must .*, got 1e-12; correct .* bounds"),
         *(("deepmind", text(one), r"metadata.json must be JSON") for one in ("[" * 9**6, '{"a": 010}', '{"a": 1:30}')),
         ("plain", text('{"a": 1,\n "b": [[0]],\n "a": 5}'), "the key a is given twice"),
         ("plain", text('{"a": 3,\n\t"b": {\n\t"c": 1,\n\t"c": 2}}'), "must be JSON, got the key c is given twice"),

@@ -69,8 +69,9 @@ class SetInfo:
         longest = max(high - low for low, high in self.bounds)
         key = "metadata.json: default_connectivity_radius"
         rule = f"at least {longest / MOST_RADII:.3g} for a box of width {longest:g}"
-        require(self.radius * MOST_RADII >= longest, key, rule, self.radius)
-        require(self.radius <= longest, key, f"at most the width of the box, {longest:g}", self.radius)
+        either = "correct it, or bounds"
+        require(self.radius * MOST_RADII >= longest, key, rule, self.radius, remedy=either)
+        require(self.radius <= longest, key, f"at most the width of the box, {longest:g}", self.radius, remedy=either)
         cell_size = self.obstacle_cell_size
         fits = cell_size is None or longest <= cell_size * MOST_CELLS <= longest * MOST_CELLS
         rule = f"from {longest / MOST_CELLS:.3g} to {longest:g}, the width of the box"
