@@ -309,6 +309,11 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
         raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
 
 
+def no_file(field: str, path: Path, remedy: str) -> ConfigError:
+    """Returns the error of a path that is no file."""
+    return ConfigError(f"{field} must be an existing file, got {path}{', a folder' * path.is_dir()}; {remedy}")
+
+
 def require_count(field: str, value: object, least: int) -> None:
     """Raises ConfigError unless an argument is a whole number of at least `least`."""
     whole = isinstance(value, Integral) and not isinstance(value, bool) and value < 2**63

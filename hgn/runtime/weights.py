@@ -30,6 +30,7 @@ from hgn.schema import (
     from_mapping,
     near_file,
     near_name,
+    no_file,
     require,
     strict_json,
     to_mapping,
@@ -130,9 +131,8 @@ def load_weights(
     that do not fit its declared structure.
     """
     if not path.is_file():
-        remedy = f"write one with python -m hgn.export checkpoint={path / 'checkpoints' / 'best.ckpt'}"
-        remedy = remedy if path.is_dir() else near_file(path) or "write one with python -m hgn.export"
-        raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
+        of_run, remedy = path / "checkpoints" / "best.ckpt", "write one with python -m hgn.export"
+        raise no_file(field, path, f"{remedy} checkpoint={of_run}" if of_run.is_file() else near_file(path) or remedy)
     with errors_name(path):
         data = path.read_bytes()  # not mapped: a file that another program cut would end the process
     try:

@@ -29,7 +29,7 @@ from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
-from hgn.schema import ConfigError, Vector, near_file, require, require_vector
+from hgn.schema import ConfigError, Vector, near_file, no_file, require, require_vector
 from hgn.system.files import errors_name
 
 _FACET = re.compile(
@@ -114,8 +114,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         remedy = "convert the mesh" if path.is_file() else near_file(path) or "convert the mesh"
         raise ConfigError(f"{field} must end in one of {endings}, got {path}; {remedy}")
     if not path.is_file():
-        remedy = near_file(path) or f"there is no file at {path.absolute()}"
-        raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
+        raise no_file(field, path, near_file(path) or f"there is no file at {path.absolute()}")
     with errors_name(path):
         data = b"" if path.suffix.lower() in USD_ENDINGS else path.read_bytes()
     try:

@@ -158,7 +158,8 @@ class GroupEntry(MaterialEntry):
         super().__post_init__()
         given = [name for name in ("shape", "size", "position") if getattr(self, name) is not None]
         if self.particles is not None:
-            require(not given, given[0] if given else "", "left out with particles", "one")
+            for name in given:
+                require(False, name, "left out with particles", getattr(self, name))
             return
         for name in ("shape", "size", "position"):
             require(name in given, name, "given", None, "or give particles, a file")

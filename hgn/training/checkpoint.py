@@ -30,6 +30,7 @@ from hgn.schema import (
     Vector,
     from_stored,
     near_file,
+    no_file,
     require,
     to_mapping,
 )
@@ -110,7 +111,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             remedy = f"no validation scene was measured, so use {last}"
         elif of_run:
             remedy = f"use {of_run[0]}"
-        raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}")
+        raise no_file("checkpoint", path, remedy)
     with opened(path) as content:
         checkpoint = _read(path, content)
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
