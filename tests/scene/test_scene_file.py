@@ -347,7 +347,7 @@ def test_every_mistake_is_named(tmp_path, content, message):
 
 
 def test_emitters(tmp_path):
-    """Particles enter through the face while it is open, as many as fill the distance that they move. Groups come
+    """Particles enter through the face while it is open, and fill the distance that they move. Groups come
     first, then the other particles in the order of their times, each with its material's constants."""
     disc = DISC | {"velocity": [0, -2, 1], "start": 0.5, "water_tension": 0.5}
     slot = {"shape": "rectangle", "size": [0.2, 0.05], "position": [0.3, 0.5, 0.5], "velocity": [0, 0, 1.5]}
