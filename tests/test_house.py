@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_611,
+    "hgn": 34_610,
     "datagen": 8_932,
     "tools": 6_295,
     "tests": 36_007,

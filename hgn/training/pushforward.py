@@ -228,16 +228,15 @@ class PushforwardPool(Generic[E, T]):
             torch.stack([x.double() for x in usable_frames(truth, path_FN3, scenes.domain_size(episode), cell_size)])
             for ((episode, _), path_FN3), truth in zip(pairs, truths, strict=True)
         ]
-        for ((episode, frame), path_FN3), truth, (count, square) in zip(
+        for ((episode, frame), path_FN3), truth, (number, square) in zip(
             pairs, truths, torch.stack(usable).tolist(), strict=True
         ):
+            count = int(number)
             if count == 0:
                 continue
-            length = len(truth) - len(path_FN3) + int(count)
+            true_TN3, simulated_FN3 = truth[: len(truth) - len(path_FN3) + count], path_FN3[:count]
             material_N, bodies = scenes.materials_and_bodies(episode)
-            windows = pushforward_windows(
-                truth[:length], path_FN3[: int(count)], cell_size, material_N=material_N, bodies=bodies
-            )
+            windows = pushforward_windows(true_TN3, simulated_FN3, cell_size, material_N=material_N, bodies=bodies)
             windows = windows.contiguous()
             accelerations = target_acceleration(windows).tolist()
             self._samples += [

@@ -46,8 +46,8 @@ def pushforward_windows(
     positions_TN3 = torch.cat([true_TN3[: history + 1], simulated_FN3])
     inputs = positions_TN3.unfold(0, history + 1, 1)[1:].permute(0, 3, 1, 2)  # [F, H + 1, N, 3]
     true_FN3, velocity_FN3 = true_TN3[history + 1 : -1].double(), true_TN3[history + 1 :].double().diff(dim=0)
-    error_FN3 = true_FN3 - simulated_FN3
-    near_FN3 = error_FN3.clamp(-LIMIT * cell_size, LIMIT * cell_size)
+    limit = LIMIT * cell_size
+    near_FN3 = (true_FN3 - simulated_FN3).clamp(-limit, limit)
     blocks = [x_FN3.split(max(1, TOGETHER // len(material_N))) for x_FN3 in (true_FN3, velocity_FN3, -near_FN3)]
     step_FN3 = torch.cat(
         [moved_velocities(x, v, offset, material_N, cell_size=cell_size) for x, v, offset in zip(*blocks, strict=True)]
@@ -55,7 +55,7 @@ def pushforward_windows(
     pull_FN3 = PULL * near_FN3
     for body_B in bodies:
         rigid_FB3 = rigidly_moved(true_FN3[:, body_B], simulated_FN3[:, body_B].double())
-        position_FB3 = (true_FN3[:, body_B] - rigid_FB3).clamp(-LIMIT * cell_size, LIMIT * cell_size)
+        position_FB3 = (true_FN3[:, body_B] - rigid_FB3).clamp(-limit, limit)
         pull_FN3[:, body_B] = PULL * position_FB3 + SHAPE_PULL * (rigid_FB3 - simulated_FN3[:, body_B])
     target_FN3 = (simulated_FN3 + step_FN3 + pull_FN3).to(simulated_FN3.dtype)
     return torch.cat([inputs, target_FN3[:, None]], dim=1)
