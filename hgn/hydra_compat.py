@@ -185,7 +185,8 @@ def _override(argument: str, folder: Path) -> str:
     key, equals, value = argument.partition("=")
     if not equals or key.startswith("-"):
         return argument
-    if re.search(r"^ |[\[{$,'\"(]", value) and Path(value).is_file():  # Hydra would parse the file's name
+    # Hydra would parse the file's name; Path.is_file raises an error for a long list
+    if re.search(r"^ |[\[{$,'\"(]", value) and os.path.isfile(value):  # noqa: PTH113
         value = "'" + value.replace("'", "\\'").replace("${", "\\${") + "'"
     elif value and not _understood(value):
         value = _in_quotes(value)

@@ -55,6 +55,10 @@ def test_names_in_lists(monkeypatch):
     monkeypatch.setattr("sys.argv", ["error_vs_time", "data=d", "weights=[a,{ü]", "out=x"])
     with pytest.raises(ConfigError, match="weights="):
         _compose("error_vs_time")
+    names = [f"network_{number}.safetensors" for number in range(400)]  # longer than the name of a file may be
+    monkeypatch.setattr("sys.argv", ["error_vs_time", "data=d", f"weights=[{','.join(names)}]", "out=x"])
+    (composed,) = _compose("error_vs_time")
+    assert composed["weights"] == names
 
 
 @pytest.mark.parametrize(
