@@ -46,6 +46,12 @@ class ParticleState:
     parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: 0, or no input
     rest: RestShape | None = None  # rest shape of elastic bodies; None: no such bodies, or no input
     moving: MovingObstacles | None = None  # moving obstacles; `obstacles` and `barriers` contain those at rest
+    frame_S: torch.Tensor = None  # type: ignore[assignment]  # int64, frames computed before; None becomes 0
+
+    def __post_init__(self) -> None:
+        if self.frame_S is None:
+            zero_S = torch.zeros_like(self.domain_S3[:, 0], dtype=torch.int64)
+            object.__setattr__(self, "frame_S", zero_S)
 
     @property
     def scene_count(self) -> int:

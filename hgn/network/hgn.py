@@ -18,6 +18,7 @@ from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
+from hgn.network.origins import frame_origin
 from hgn.network.relative import OUTPUTS, balanced
 
 
@@ -77,7 +78,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
         """Returns the network's raw output [N, 3], which the loss compares with the normalised target.
 
-        `origin_S3` is the finest grid's origin in each scene, by default 0.
+        `origin_S3` is the finest grid's origin in each scene, by default that of the scene's frame.
         """
         return self.prediction(state, origin_S3).acceleration_N3
 
@@ -99,9 +100,9 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """Returns the cells of all levels around a state's particles."""
-        if origin_S3 is None:
-            origin_S3 = torch.zeros_like(state.domain_S3)
         cell_size, levels, bodies = self.config.cell_size, self.config.levels, self.config.body_cells
+        if origin_S3 is None:
+            origin_S3 = frame_origin(state.frame_S, cell_size, self.config.dimensions).to(state.domain_S3)
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, cell_size, levels, bodies)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

@@ -74,8 +74,8 @@ def simulate(
     predicted = Accelerations(network)
     weights = {name: tensor.detach() for name, tensor in predicted.state_dict(keep_vars=True).items()}
 
-    def step(*variables: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        before = _with_variables(state, variables)
+    def step(before: ParticleState, *variables: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        before = _with_variables(before, variables)
         acceleration_N3 = functional_call(predicted, weights, (before,))
         after = advanced(before, acceleration_N3, network.step, network.config.dimensions)
         return after.position_N3, after.velocity_NM3
@@ -84,7 +84,8 @@ def simulate(
     positions = [state.position_N3]
     for frame in range(1, frames):
         try:
-            variables[:2] = _Frame.apply(step, *variables)
+            before = replace(state, frame_S=state.frame_S + frame - 1)
+            variables[:2] = _Frame.apply(functools.partial(step, before), *variables)
         except GridRangeError as error:
             raise DivergedError(frame, str(error)) from None
         lost = int(diverged(variables[0].detach(), state.domain_S3.detach()[state.scene_N]).sum())

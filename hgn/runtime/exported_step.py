@@ -43,9 +43,10 @@ from hgn.step.reference import accelerations, constrained, moved, next_state
 from hgn.system.files import make_folder, sync_folder, sync_written, write_atomically
 
 INPUTS = (
-    "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal",
+    "position", "velocity", "frame", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal",
     "obstacle_triangle",
 )  # fmt: skip
+NAMED = len(INPUTS) - 1  # inputs that are arguments of `Step.forward` by name
 OWN_INPUTS = {
     "friction": ("wall_friction", "obstacle_friction"),
     "parameters": ("parameters",),
@@ -79,28 +80,29 @@ class Step(nn.Module):
         self,
         position: torch.Tensor,
         velocity: torch.Tensor,
+        frame: torch.Tensor,
         material: torch.Tensor,
         domain_size: torch.Tensor,
         gravity: torch.Tensor,
         obstacle_cell: torch.Tensor,
         obstacle_normal: torch.Tensor,
-        obstacle_triangle: torch.Tensor,
-        *own: torch.Tensor,
+        *others: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns positions [N, 3] and velocities [N, H, 3], newest first, one frame later, in domain units and frames.
 
+        `frame`, int64 [1], is the number of frames before, 0 for the first one; it gives the origin of the grid.
         `material`, int64 [N], indexes the network's materials. `domain_size` and `gravity` are [3]. `obstacle_cell` is
         int64 [K, 3] without repetition, `obstacle_normal` [K, 3], with `obstacle_distance` [K, 4] with the distance of
-        the cell's centre last. `obstacle_triangle` [F, 3, 3] are corners. Networks with absolute inputs ignore gravity;
-        networks without `obstacle_clearance` ignore triangles.
+        the cell's centre last. Networks with absolute inputs ignore gravity.
 
-        `own` contains the inputs of OWN_INPUTS that the network has: friction of the walls normal to x, y, z [3], and
-        of obstacle cells [K]; values of INPUT_PARAMETERS [N, P]; rest positions [R, 3], and rest neighbours, int64 [R,
-        B], -1 for none; poses x -> R x + t of moving obstacles, R and then t, in this frame and the next [2, V, 3, 4],
-        their cells, int64 [K, 4], the obstacle's number first, normals and friction of these [K, 4], with
+        The first of `others` is `obstacle_triangle` [F, 3, 3], corners that networks without `obstacle_clearance`
+        ignore. Then follow the inputs of OWN_INPUTS that the network has: friction of the walls normal to x, y, z [3],
+        and of obstacle cells [K]; values of INPUT_PARAMETERS [N, P]; rest positions [R, 3], and rest neighbours, int64
+        [R, B], -1 for none; poses x -> R x + t of moving obstacles, R and then t, in this frame and the next [2, V, 3,
+        4], their cells, int64 [K, 4], the obstacle's number first, normals and friction of these [K, 4], with
         `obstacle_distance` [K, 5], and triangles [V, F, 3, 3].
         """
-        given = dict(zip(input_names(self.network.config)[len(INPUTS) :], own, strict=False))
+        given = dict(zip(input_names(self.network.config)[NAMED:], others, strict=False))
         # Another cell, out of reach of every particle, so that the lists are never empty.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
@@ -114,8 +116,9 @@ class Step(nn.Module):
             scene_N=torch.zeros_like(material),
             domain_S3=domain_size[None],
             gravity_S3=gravity[None],
+            frame_S=frame,
             obstacles=replace(obstacles, friction_K=friction_K),
-            barriers=self._barriers(obstacle_triangle),
+            barriers=self._barriers(given["obstacle_triangle"]),
             **self._own_fields(given, material),
         )
         acceleration_N3 = accelerations(self.network, state, self.network.prediction(state))
@@ -194,8 +197,9 @@ def initial_arrays(
     if parameter_NP is None:
         parameter_NP = np.tile(np.array(NOMINAL_P, np.float32), (len(state.position_N3), 1))
     walls, rest = state.wall_friction_S3, state.rest
-    tensors = (state.position_N3, state.velocity_NM3, state.material_N, state.domain_S3[0], state.gravity_S3[0])
-    arrays = dict(zip(INPUTS, [*(x.cpu().numpy() for x in tensors), cells, normals, triangles], strict=True))
+    first = (state.position_N3, state.velocity_NM3, state.frame_S, state.material_N)
+    tensors = [x.cpu().numpy() for x in (*first, state.domain_S3[0], state.gravity_S3[0])]
+    arrays = dict(zip(INPUTS, [*tensors, cells, normals, triangles], strict=True))
     arrays |= {
         "wall_friction": np.zeros(3, np.float32) if walls is None else walls[0].cpu().numpy(),
         "obstacle_friction": np.zeros(len(cells), np.float32) if friction is None else friction.cpu().numpy(),
@@ -250,6 +254,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo, moving: int = 0) ->
     examples = {
         "position": (position_N3, particles),
         "velocity": (velocity_NH3, particles),
+        "frame": (torch.ones(1, dtype=torch.int64), None),
         "material": (torch.zeros(EXAMPLE_PARTICLES, dtype=torch.int64), particles),
         "domain_size": (torch.ones(3), None),
         "gravity": (torch.zeros(3), None),
@@ -270,7 +275,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo, moving: int = 0) ->
             "moving_triangle": (torch.rand(moving, EXAMPLE_TRIANGLES, 3, 3, generator=generator), moving_triangles),
         }
     example, dynamic = zip(*(examples[name] for name in input_names(config) if name in examples), strict=True)
-    dynamic = dynamic[: len(INPUTS)] + ((dynamic[len(INPUTS) :],) if dynamic[len(INPUTS) :] else ())
+    dynamic = (*dynamic[:NAMED], dynamic[NAMED:])
     step = Step(network, info.obstacle_cell_size).eval()
     # One graph serves 0, 1 and more particles, cells and triangles.
     with (

@@ -58,7 +58,6 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         self.simulation = simulator.simulation(state, capacity, isolate=given is scenes)
         self._closed = False
         self._changed: ParticleState | None = None  # state from which the next frame starts; None without changes
-        self._numbers = [0] * len(self.scenes)  # each scene's `frame`, which `restore` of another scene does not change
         # for `restore`: moving obstacles of each scene before each of its moves, with the frame of their keyframes
         self._before_moves: list[list[tuple[int, tuple[MovingObstacle, ...]]]] = [[] for _ in self.scenes]
 
@@ -78,12 +77,14 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
     @frame.setter
     def frame(self, frame: int) -> None:
         require_count("frame", frame, 0)
-        self.simulation.frame, self._numbers = frame, [frame] * len(self.scenes)
+        state = self.state
+        self.simulation.frame, self._changed = frame, replace(state, frame_S=torch.full_like(state.frame_S, frame))
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Returns the number of each scene's last frame. They differ after `restore` of one of several scenes."""
-        return tuple(self._numbers)
+        """Returns the number of each scene's last frame. They differ after `reset` or `restore` of one of several."""
+        frame_S = self.simulation.scene_frames if self._changed is None else self._changed.frame_S
+        return tuple(frame_S.tolist())
 
     @property
     def state(self) -> ParticleState:
@@ -103,12 +104,8 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         if self._changed is not None:
             self.simulation.continue_from(self._changed)
             self._changed = None
-        before = self.frame
-        try:
-            for _ in self.simulation.blocks(1):
-                pass
-        finally:
-            self._numbers = [number + self.frame - before for number in self._numbers]
+        for _ in self.simulation.blocks(1):
+            pass
         self.ended |= self.simulation.ended
         return self.state
 
@@ -126,6 +123,7 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         start, state = InitialState.of(scene), self.state
         self._put(index, start, state.selected(state.scene_N != index), self._started([start]), restart=True)
         self.ended.pop(index, None)
+        self.simulation.frame = max(self.frames)
 
     def add_particles(
         self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray, index: int = 0
@@ -200,7 +198,7 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         Raises: ConfigError for a later frame.
         """
         self._require_scene(index)
-        state, number = self.state, self._numbers[index]
+        state, number = self.state, self.frames[index]
         mine_N = state.scene_N == index
         require_count("frame", frame, 0)
         require(frame <= number, "frame", f"at most {number}, the scene's last frame", frame)
@@ -221,8 +219,8 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
             while moves and moves[-1][0] >= frames[index]:
                 own = moves.pop()[1]
             state = replace(state, moving=self._moved(state.moving, frames, index, own))
-        self.simulation.frame = self._numbers[index] = frame
-        self._continue(state.selected(~mine_N), start)
+        self.simulation.frame = frame
+        self._continue(self._at(state.selected(~mine_N), index, frame), start)
 
     def _moved(
         self, moving: MovingObstacles, frames: Sequence[int], index: int, own: Sequence[MovingObstacle]
@@ -231,6 +229,13 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
         self.scenes = [*self.scenes]
         self.scenes[index] = replace(self.scenes[index], moving=tuple(own))
         return replace(moving, scenes=tuple(scene.moving for scene in self.scenes)).at(frames)
+
+    @staticmethod
+    def _at(state: ParticleState, index: int, frame: int) -> ParticleState:
+        """Returns the state with scene `index` at another frame."""
+        frame_S = state.frame_S.clone()
+        frame_S[index] = frame
+        return replace(state, frame_S=frame_S)
 
     def _require_scene(self, index: int) -> None:
         require(not self._closed, "simulation", "open", "closed", remedy="start another one")
@@ -280,7 +285,8 @@ class LiveSimulation(AbstractContextManager["LiveSimulation"]):
             if values_S3 is not None or own_S3 is not None:
                 changed[name] = torch.zeros_like(kept.domain_S3) if values_S3 is None else values_S3.clone()
                 changed[name][index] = 0 if own_S3 is None else own_S3[0]
-        self._continue(replace(kept, **changed), replace(new, scene_N=new.scene_N + index))
+        kept = replace(self._at(kept, index, 0) if restart else kept, **changed)
+        self._continue(kept, replace(new, scene_N=new.scene_N + index))
         self.scenes, self._barriers = scenes, barriers
         if "moving" in changed:
             self._before_moves[index] = []

@@ -46,6 +46,7 @@ def require_moving_parity(
         position_N3=state.position_N3.clone(), velocity_NV=state.velocity_NM3.flatten(1), scene_N=state.scene_N.int(),
         material_N=state.material_N.int(), origin_S3=torch.zeros_like(domain_S3), domain_S3=domain_S3,
         gravity_S3=state.gravity_S3, count=torch.tensor([len(still_P3)], dtype=torch.int32, device=device),
+        frame_S=state.frame_S,
     )  # fmt: skip
     lost, frame = (torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
     barriers = SceneTable.of_barriers(None, len(domain_S3), device)

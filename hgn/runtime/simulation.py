@@ -82,11 +82,17 @@ class Simulation(AbstractContextManager["Simulation"]):
     @property
     def state(self) -> ParticleState:
         """Returns the state after the last frame, without ended scenes; read-only."""
-        state = replace(self._state, moving=self._state.moving and self._state.moving.later(self._passed))
+        moving = self._state.moving and self._state.moving.later(self._passed)
+        state = replace(self._state, moving=moving, frame_S=self.scene_frames)
         if self.stepper is None:
             return state
         position_N3, velocity_NM3 = self.stepper.motion()
         return replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
+
+    @property
+    def scene_frames(self) -> torch.Tensor:
+        """Returns the numbers of frames that the scenes have computed, int64 [S]."""
+        return self._state.frame_S + self._passed
 
     @property
     def particle_count(self) -> int:

@@ -28,6 +28,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.moving import MovingObstacles
+from hgn.network.origins import frame_origin
 from hgn.network.own_physics import has_friction
 from hgn.runtime.moving_parity import require_moving_parity
 from hgn.runtime.parity import OUTPUTS, ParityError, require_parity
@@ -215,6 +216,9 @@ class TritonStepper:
         buffers.scene_N[:count].copy_(state.scene_N)
         buffers.material_N[:count].copy_(state.material_N)
         buffers.domain_S3.copy_(state.domain_S3)
+        buffers.frame_S.copy_(state.frame_S)
+        # those of later frames are written by the last kernel of a frame
+        buffers.origin_S3.copy_(frame_origin(state.frame_S, self.config.cell_size, self.config.dimensions))
         if self.config.relative:
             buffers.gravity_S3.copy_(state.gravity_S3)
         if buffers.wall_friction_S3 is not None:

@@ -128,7 +128,8 @@ def next_state(state: ParticleState, motion: Motion) -> ParticleState:
     """Returns the state after a motion. It stores the velocity itself, not a difference of positions."""
     history_NM3 = torch.cat([motion.velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
     moving = state.moving and state.moving.later()
-    return replace(state, position_N3=motion.position_N3, velocity_NM3=history_NM3, moving=moving)
+    state = replace(state, moving=moving, frame_S=state.frame_S + 1)
+    return replace(state, position_N3=motion.position_N3, velocity_NM3=history_NM3)
 
 
 def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:

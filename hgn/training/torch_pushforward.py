@@ -49,7 +49,9 @@ class TorchScenes:
                 raise SimulationStoppedError
 
         batch = make_batch(starts, self._network.config).to(self._backend.device)
-        begin = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
+        frame_S = torch.tensor([frame for _, frame in starts], device=self._backend.device)
+        barriers = self._barriers([episode for episode, _ in starts])
+        begin = replace(batch.state(), barriers=barriers, frame_S=frame_S)
         clearance = self._backend.step.obstacle_clearance
         if begin.moving is not None and clearance is not None:
             begin = replace(begin, moving=begin.moving.with_barriers(clearance))

@@ -93,7 +93,8 @@ class TritonScenes:
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
         empty = max(0, self._training.pushforward_scenes - len(episodes))
         placed = [*episodes, *[episodes[0]] * empty]  # the domain of an empty scene is arbitrary
-        own: dict[str, Any] = {}
+        frames = [episode.first_frame + frame for episode, frame in starts] + [0] * empty
+        own: dict[str, Any] = {"frame_S": torch.tensor(frames, device=device)}
         if "friction" in self._network.config.own_physics:
             own["wall_friction_S3"] = torch.tensor([episode.wall_friction for episode in placed], device=device)
         if "parameters" in self._network.config.own_physics:
@@ -104,7 +105,6 @@ class TritonScenes:
             own["rest"] = RestShape.joined(shapes, [e.particles for e in episodes])
         if "moving" in self._network.config.own_physics:
             bodies = [episode.moving.obstacles for episode in episodes] + [()] * empty
-            frames = [episode.first_frame + frame for episode, frame in starts] + [0] * empty
             config, clearance = self._network.config, self._network.step.in_training.obstacle_clearance
             moving = MovingObstacles.of(bodies, frames, episodes[0].moving.frame_s, config, clearance=clearance)
             own["moving"] = moving and moving.to(device)

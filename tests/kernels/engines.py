@@ -74,6 +74,7 @@ def prepare(engine, network, state, origin_S3):
         domain_S3=state.domain_S3.float().to(where),
         gravity_S3=state.gravity_S3.float().to(where),
         count=engine.particle_count,
+        frame_S=state.frame_S.to(where),
         wall_friction_S3=None if walls_S3 is None else walls_S3.float().to(where),
         parameter_NP=None if state.parameter_NP is None else padded(columns_NP.float()),
         rest_NR=state.rest and padded(state.rest.packed),

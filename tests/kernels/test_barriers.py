@@ -48,7 +48,7 @@ def integrated(state, way_N3, step, table):
     output[:, :3] = way_N3
     particles = DeviceParticles(
         state.position_N3.clone(), way_N3.new_zeros(count, 3), state.scene_N.int(), state.scene_N.int(),
-        torch.zeros_like(state.domain_S3), state.domain_S3, state.gravity_S3, count * one,
+        torch.zeros_like(state.domain_S3), state.domain_S3, state.gravity_S3, count * one, state.frame_S,
     )  # fmt: skip
     path_TN3 = way_N3.new_zeros(1, count, 3)
     DeviceStep(step, grid, table).integrate(

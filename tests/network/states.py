@@ -53,6 +53,7 @@ def scene_of(state, scene, obstacles=None):
     """One scene taken out of a batch."""
     alone, here = chosen(state, state.scene_N == scene), slice(scene, scene + 1)
     scenes = {"scene_N": 0 * alone.scene_N, "domain_S3": state.domain_S3[here], "gravity_S3": state.gravity_S3[here]}
+    scenes["frame_S"] = state.frame_S[here]
     return replace(alone, **scenes, obstacles=obstacles)
 
 

@@ -138,6 +138,7 @@ def test_the_pool_is_what_the_network_does(network):
     expected = []
     for made, frame in starts:
         state = make_batch([(made, frame)], network.config).state()
+        state = replace(state, frame_S=torch.tensor([frame]))
         path = []
         for _ in range(3):
             state = Simulator(network, 60.0).step(state)

@@ -63,7 +63,7 @@ class TritonFrame(Contender):
         return milliseconds
 
     def check(self, precision: str) -> str:
-        self.restore()
+        self.stepper.begin(self.state)  # at its frame, whose grid origin PyTorch has too
         for _ in self.stepper.blocks(1):  # allocates memory if necessary
             pass
         return check_acceleration(self.stepper.buffers.velocity_NV[:, :3], self.network, self.state, precision)

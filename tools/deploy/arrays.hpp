@@ -55,9 +55,10 @@ inline void write_positions(const std::string& path, const std::vector<float>& v
     if (!file.flush()) throw std::runtime_error(path + " could not be written");
 }
 
-// Order and names of a step's inputs; the first two are replaced by its two outputs.
+// Order and names of a step's inputs; the first two are replaced by its two outputs, and the third is increased by 1.
 inline const std::vector<std::string> INPUTS = {
-    "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal", "obstacle_triangle"};
+    "position",      "velocity",        "frame", "material", "domain_size", "gravity",
+    "obstacle_cell", "obstacle_normal", "obstacle_triangle"};
 // The inputs that follow if the network has them: friction, parameters of materials, elastic bodies, moving obstacles.
 inline const std::vector<std::string> OWN_INPUTS = {
     "wall_friction", "obstacle_friction", "parameters",     "rest_position",  "rest_neighbour",

@@ -31,11 +31,13 @@ int main(int count, char** words) try {
     std::vector<float> positions;
     const auto start = std::chrono::steady_clock::now();
     for (int frame = 0;; frame++) {
+        const int64_t number = frame;
         const float* position = inputs[0].GetTensorData<float>();
         for (int64_t i = 0; i < 3 * particles; i++)
             if (!std::isfinite(position[i])) throw std::runtime_error("the simulation diverged at frame " + std::to_string(frame));
         positions.insert(positions.end(), position, position + 3 * particles);
         if (frame == frames - 1) break;
+        std::memcpy(arrays[2].bytes.data(), &number, sizeof number);  // inputs[2] reads it there
         Array poses;
         for (size_t i = 0; i < arrays.size(); i++)
             if (arrays[i].name == "moving_pose") inputs[i] = tensor(poses = poses_at(arrays[i], frame));

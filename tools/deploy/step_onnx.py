@@ -17,6 +17,7 @@ def simulate(model: str, arrays: str, frames: int) -> np.ndarray:
     inputs = {item.name: np.load(Path(arrays) / f"{item.name}.npy") for item in session.get_inputs()}
     positions, poses = [inputs["position"]], inputs.get("moving_pose", [])
     for frame in range(1, frames):
+        inputs["frame"] = np.array([frame - 1])  # the number of frames before
         if len(poses):  # those of the frame before and of this frame; at last the obstacles rest
             inputs["moving_pose"] = poses[min(frame - 1, len(poses) - 2) :][:2]
         inputs["position"], inputs["velocity"] = session.run(["next_position", "next_velocity"], inputs)

@@ -89,6 +89,7 @@ class DeviceParticles:
     domain_S3: torch.Tensor
     gravity_S3: torch.Tensor  # zero with absolute inputs, whose network has learned gravity
     count: torch.Tensor  # number of particles, int32 [1]
+    frame_S: torch.Tensor  # as in ParticleState
     wall_friction_S3: torch.Tensor | None = None  # None: no surface has friction
     # columns of hgn.network.own_physics; None: all are 0. With `rest_NR` those of elastic bodies follow.
     parameter_NP: torch.Tensor | None = None
@@ -104,6 +105,7 @@ class DeviceParticles:
             torch.zeros(size, dtype=torch.int32, device=device) for size in (particles, particles, 1)
         )
         origin_S3, domain_S3, gravity_S3 = (torch.zeros(scenes, 3, device=device) for _ in range(3))
+        frame_S = torch.zeros(scenes, dtype=torch.int64, device=device)
         friction_S3 = torch.zeros(scenes, 3, device=device) if "friction" in own_physics else None
         parameter_NP = rest_NR = None
         width = len(INPUT_PARAMETERS) * ("parameters" in own_physics) + elastic.COLUMNS * ("elastic" in own_physics)
@@ -112,8 +114,8 @@ class DeviceParticles:
         if "elastic" in own_physics:
             rest_NR = torch.full((particles, elastic.PACKED), -1, dtype=torch.int32, device=device)
         return DeviceParticles(
-            position_N3, velocity_NV, scene_N, material_N, origin_S3, domain_S3, gravity_S3, count, friction_S3,
-            parameter_NP, rest_NR,
+            position_N3, velocity_NV, scene_N, material_N, origin_S3, domain_S3, gravity_S3, count, frame_S,
+            friction_S3, parameter_NP, rest_NR,
         )  # fmt: skip
 
 

@@ -12,11 +12,15 @@ from hgn.kernels.geometry import GEOMETRY_COLUMNS, lowest_middle, middles_around
 from hgn.kernels.obstacles import BARRIER_COLUMNS
 from hgn.kernels.step.barriers import between_walls, stopped_by_moving, stopped_by_obstacles, wall_limit
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
+from hgn.network.origins import FRACTION_BITS, STEPS
 from hgn.step.reference import LEAST, SURE
 
 RATES = tl.constexpr(8)  # number of columns of the sums and of the table of rest
 SURELY, TINY = tl.constexpr(SURE), tl.constexpr(LEAST)
 DIVERGED = tl.constexpr(4)
+X_STEP, Y_STEP, Z_STEP = (tl.constexpr(step) for step in STEPS)
+DROPPED_BITS, FRACTION_UNIT = tl.constexpr(32 - FRACTION_BITS), tl.constexpr(1 / 2**FRACTION_BITS)
+SCENE_BLOCK = tl.constexpr(32)  # scenes that `advance` handles together
 
 
 @triton.jit
@@ -291,15 +295,28 @@ def integrate(
 
 
 @triton.jit
-def advance(status, lost, frame, OVERLAP: tl.constexpr):
+def advance(
+    status, lost, frame, frame_of, origin, scenes, cell_size, DIMENSIONS: tl.constexpr, OVERLAP: tl.constexpr
+):  # fmt: skip
     """Increments the frame if it was integrated, and sets the status to DIVERGED if coordinates were lost.
 
-    Rule: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
+    It then also increments the frames `frame_of` of all scenes, int64, and writes the origins of their next grids.
+
+    Rule: hgn.runtime.torch_stepper and hgn.network.origins; test: tests/kernels/test_origins.py.
     """
     if OVERLAP:
         gdc_wait()
     if tl.load(status) == 0:
         tl.store(frame, tl.load(frame) + 1)
+        for first in range(0, scenes, SCENE_BLOCK):
+            scene = first + tl.arange(0, SCENE_BLOCK)
+            there = scene < scenes
+            number = tl.load(frame_of + scene, mask=there, other=0) + 1
+            tl.store(frame_of + scene, number, mask=there)
+            for axis in tl.static_range(DIMENSIONS):
+                step = (X_STEP, Y_STEP, Z_STEP)[axis]
+                fraction = ((number * step & 0xFFFFFFFF) >> DROPPED_BITS).to(tl.float32) * FRACTION_UNIT
+                tl.store(origin + scene * 3 + axis, fraction * -cell_size, mask=there)
         if tl.load(lost) > 0:
             tl.store(status, DIVERGED)
 

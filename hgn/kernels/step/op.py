@@ -105,7 +105,7 @@ class DeviceStep:
         path_TN3: torch.Tensor,
         moving: MovingTable | None = None,
     ) -> None:
-        """Moves particles by the result of `rest`, stops them at walls and obstacles, and increments the frame.
+        """Moves particles by the result of `rest`, stops them at walls and obstacles, and increments the frames.
         `normaliser` is the mean and standard deviation of accelerations."""
         step, config, status, overlap = self.step, self.config, self.grid.status, overlaps()
         near, far = step.wall_clearance or (0.0, 0.0)
@@ -123,4 +123,8 @@ class DeviceStep:
             MOVING=0 if moving is None or self.barriers is None else moving.layers, OVERLAP=overlap,
             BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
-        kernel.advance[(1,)](status=status, lost=lost, frame=frame, OVERLAP=overlap, num_warps=1, launch_pdl=overlap)
+        kernel.advance[(1,)](
+            status=status, lost=lost, frame=frame, frame_of=particles.frame_S, origin=particles.origin_S3,
+            scenes=len(particles.frame_S), cell_size=config.cell_size, DIMENSIONS=config.dimensions, OVERLAP=overlap,
+            num_warps=1, launch_pdl=overlap,
+        )  # fmt: skip
