@@ -41,6 +41,8 @@ from hgn.system.files import errors_name, make_folder, write_atomically
 from hgn.system.hub import hub_weights
 
 FORMAT_VERSION = 1
+MOST_BYTES = 2**31  # of a file: 500 million parameters in fp32
+NUMBERS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 SUFFIX = ".safetensors"
 SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # folder of the shipped files, each with a card NAME.md
 
@@ -80,6 +82,8 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored
         tensors[name] = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
     require_finite(tensors, "weights")
     payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
+    remedy = "use a smaller network.width"
+    require(len(payload) <= MOST_BYTES, "weights", f"a file of at most {MOST_BYTES} bytes", len(payload), remedy=remedy)
     make_folder(path.parent)
     write_atomically(path, payload)
 
@@ -133,6 +137,8 @@ def load_weights(
     if not path.is_file():
         of_run, remedy = path / "checkpoints" / "best.ckpt", "write one with python -m hgn.export"
         raise no_file(field, path, f"{remedy} checkpoint={of_run}" if of_run.is_file() else near_file(path) or remedy)
+    size, rule = path.stat().st_size, f"a file of at most {MOST_BYTES} bytes"
+    require(size <= MOST_BYTES, field, rule, size, remedy=f"export {path} again")
     with errors_name(path):
         data = path.read_bytes()  # not mapped: a file that another program cut would end the process
     try:
@@ -170,7 +176,8 @@ def network_with(
     claims, numbers = Claims(path), 0
     for name, tensor in tensors.items():
         claims.add(f"{field} tensor {name}", tensor.numel(), 4)
-        require(tensor.is_floating_point(), f"{field} tensor {name}", "of floating point numbers", str(tensor.dtype))
+        rule, kind = "of float16, bfloat16, float32 or float64", str(tensor.dtype)
+        require(tensor.dtype in NUMBERS, f"{field} tensor {name}", rule, kind, remedy="export again")
         numbers += tensor.numel()
     # message passing has two square matrices per step; a network is not much larger than these
     count = 2 * config.message_passing_steps * (2 * config.levels - 1)
@@ -189,10 +196,10 @@ def network_with(
                 f"{field} tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
                 f"got {_shape(shape)} in {path}; these are the weights of another network"
             )
-    for name in ("normaliser.velocity_std", "normaliser.acceleration_std"):
-        smallest, remedy = float(tensors[name].min()), f"{path} is damaged; export again"
-        require(not smallest <= 0, f"{field} tensor {name}", "above 0", smallest, remedy=remedy)  # NaN: require_finite
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    for name in ("velocity_std", "acceleration_std"):  # NaN: require_finite
+        smallest, remedy = float(getattr(network.normaliser, name).min()), f"{path} is damaged; export again"
+        require(not smallest < 1e-30, f"{field} tensor normaliser.{name}", "at least 1e-30", smallest, remedy=remedy)
     return network
 
 

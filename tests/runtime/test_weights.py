@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -150,7 +151,10 @@ def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
         *((cut(kept), "weights must be a safetensors file, got") for kept in (0.01, 0.5, 0.999)),
         (lambda file: save_file(content(file)[0], file), r"file of python -m hgn\.export, got .* without its struct"),
         (lambda file: rewrite(file, lambda tensors, _: tensors.update(a=torch.zeros(1, dtype=torch.complex64))),
-         "weights tensor a must be of floating point numbers, got 'torch.complex64'"),
+         "weights tensor a must be of float16, bfloat16, float32 or float64, got 'torch.complex64'"),
+        *((stored(name, 1.0, kind), rf"tensor {name} must be of float16, .* or float64, got '{kind}'; export again")
+          for name in ("normaliser.velocity_std", "normaliser.acceleration_mean", "embedding.weight")
+          for kind in (torch.float8_e4m3fn, torch.float8_e5m2, torch.int64, torch.bool)),
         (structure("{not json"), "weights must declare their structure as JSON"),
         (structure("[1, 2]"), "weights format_version must be 1, got None"),
         (structure('{"format_version": 1}'), r"weights\.network is missing"),
@@ -172,8 +176,11 @@ def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
           for value, kind, got in ((math.nan, torch.float32, "nan"), (math.inf, torch.float16, "inf"),
                                    (-math.inf, torch.bfloat16, "-inf"), (1e300, torch.float64, "inf"))),
         (stored("normaliser.velocity_std", math.nan), "tensor normaliser.velocity_std must be finite in fp32, got nan"),
-        *((stored(f"normaliser.{name}_std", value), f"tensor normaliser.{name}_std must be above 0, got {value}")
-          for name, value in (("velocity", 0.0), ("acceleration", -0.5))),
+        *((stored(f"normaliser.{name}_std", value, kind), rf"normaliser.{name}_std must be at least 1e-30, got {got}")
+          for name, value, kind, got in (
+              ("velocity", 0.0, torch.float32, "0.0"), ("acceleration", -0.5, torch.float16, "-0.5"),
+              ("velocity", 1e-300, torch.float64, "0.0"), ("acceleration", 1e-46, torch.float64, "0.0"),
+              ("acceleration", 1e-39, torch.bfloat16, "1.0.*e-39"), ("velocity", 1e-31, torch.float32, "9.9.*e-32"))),
         *((info(**{name: value}), rf"weights\.{name}{at} must be {rule}, got {got}")
           for name, value, at, rule, got in (
               ("updates", -1, "", "a finite number >= 0", "-1"),
@@ -199,6 +206,21 @@ def test_what_is_no_such_file_is_refused(weights, change, message):
     with pytest.raises(ConfigError, match=message):
         load_weights(weights)
     assert before == (weights.read_bytes() if weights.exists() else None)
+
+
+@pytest.mark.parametrize("size", [2**31 + 1, 10**11])
+def test_a_file_larger_than_any_network(weights, monkeypatch, size):
+    """It is refused before it is read: a sparse file of any size takes no space on a disk. None is written."""
+    network, info = load_weights(weights)
+    os.truncate(weights, size)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", lambda path: pytest.fail("read"))
+        with pytest.raises(ConfigError, match=f"weights must be a file of at most 2147483648 bytes, got {size}; exp"):
+            load_weights(weights)
+    monkeypatch.setattr("hgn.runtime.weights.MOST_BYTES", 1000)
+    with pytest.raises(ConfigError, match=r"weights must be a file of at most 1000 bytes, got \d+; use a smaller netw"):
+        save_weights(weights.with_name("new.safetensors"), network, info)
+    assert not weights.with_name("new.safetensors").exists()
 
 
 def test_numbers_that_are_not_finite_are_not_written(weights):
