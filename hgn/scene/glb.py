@@ -90,7 +90,7 @@ class _File:
     def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path, claims: Claims) -> None:
         self.tree = {key: _Entries(value) if isinstance(value, list) else value for key, value in tree.items()}
         self.binary, self.folder, self.claims = binary, folder.resolve(), claims
-        self.buffer, self.read = cache(self._buffer), cache(Path.read_bytes)  # buffers may be the same file
+        self.buffer, self.read = cache(self._buffer), cache(self._read)  # buffers may be the same file
 
     def placed(self) -> list[tuple[int, list[float], np.ndarray]]:
         """Returns the number of each mesh of the scene, the weights of its morph targets, its matrices [M, 4, 4]."""
@@ -228,7 +228,12 @@ class _File:
         path = (self.folder / unquote(uri)).resolve()
         if not (path.is_file() and path.is_relative_to(self.folder)):
             raise FileNotFoundError(f"it names {uri!r}, which is not a file in its folder")
-        return self.read(path)
+        return self.read(path, self.tree["buffers"][index]["byteLength"])
+
+    def _read(self, path: Path, size: int) -> bytes:
+        self.claims.add(path.name, size)
+        with path.open("rb") as file:
+            return file.read(size)
 
 
 def _numbers(entry: dict[str, Any], has: str, name: str, count: int | None = None) -> list[float] | None:

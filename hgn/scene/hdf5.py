@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import h5py
 
 _DEPTH = 8  # largest depth of groups
+EXPANDED = 1 << 18  # bytes of a compressed chunk that gzip expands to at most 270 MB
 _CHUNK_BYTES = 512  # of HDF5's memory for a chunk of a few numbers
 # exceptions of h5py for damage, and of NumPy for a size in a damaged file
 _DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
@@ -122,12 +124,34 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
             size = item.dtype.itemsize * (math.prod(chunk) if chunk else item.size or 0)
             claims.add(item.name, max(count, 1), max(size, _CHUNK_BYTES) if chunk else size)
             plan, plain = item.id.get_create_plist(), (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
-            packed = sum(plan.get_filter(i)[0] not in plain for i in range(plan.get_nfilters()))
+            filters = [plan.get_filter(i)[::3] for i in range(plan.get_nfilters())]
+            read = *plain, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_LZF
+            # other filters trust parameters in the file, and would read and write beyond their memory
+            for number, label in filters:
+                if number not in read:
+                    rule, shown = "plain or compressed with gzip or lzf", label.decode("ascii", "replace")
+                    raise ConfigError(f"{path}: {item.name} must be {rule}, got filter {number} ({shown}); rewrite it")
+            packed = sum(number not in plain for number, _ in filters)
             stored = item.id.get_storage_size()  # HDF5 expands it without a limit
             written = item.id.get_num_chunks() if chunk else min(stored, 1)
             # HDF5 would read zeros, unless the file names another value
             if item.size and written < count and plan.fill_value_defined() != h5py.h5d.FILL_VALUE_USER_DEFINED:
                 raise ConfigError(f"{path}: {item.name} must be written as a whole, got {written} of {count} chunks")
-            if packed > 1 or (packed and stored > 2 * count * size + (1 << 16)):
-                rule = f"compressed once, to fewer than its {count * size} bytes"
-                raise ConfigError(f"{path}: {item.name} must be {rule}, got {packed} filters, {stored} bytes")
+            more = packed > 1 or (packed and stored > 2 * count * size + (1 << 16))
+            if more or (packed and filters[-1][0] == h5py.h5z.FILTER_SHUFFLE) or _expands(item, size):
+                rule = f"compressed once, as the last step, from its {count * size} bytes to fewer"
+                raise ConfigError(f"{path}: {item.name} must be {rule}, got {len(filters)} filters, {stored} bytes")
+
+
+def _expands(item: h5py.Dataset, size: int) -> bool:
+    """Returns whether a chunk compressed with gzip expands to more than `size` bytes, and a checksum."""
+    chunks: list[Any] = []
+    if item.compression == "gzip":
+        item.id.chunk_iter(chunks.append)
+    for chunk in chunks:
+        if chunk.size > EXPANDED:
+            with contextlib.suppress(zlib.error):  # of a chunk that is damaged, or not compressed
+                content = item.id.read_direct_chunk(chunk.chunk_offset)[1]
+                if len(zlib.decompressobj().decompress(content, size + 5)) > size + 4:
+                    return True
+    return False

@@ -103,7 +103,9 @@ def _read_archive(file: BinaryIO, path: Path | BinaryIO, objects: bool) -> Itera
                 kinds = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
                 if member == info.filename or info.compress_type not in kinds:
                     raise ConfigError(f"{path}: {member} must be an array (.npy), as numpy.savez writes it")
-                yield member, _read_array(archive.read(info), f"{path}: {member}", objects)
+                with archive.open(info) as content:
+                    data = content.read(info.file_size)  # without a size zipfile expands a longer stream first
+                yield member, _read_array(data, f"{path}: {member}", objects)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise ConfigError(f"{path} must be a complete NumPy archive, got {error}; fetch it again") from None
 

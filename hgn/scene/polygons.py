@@ -66,6 +66,8 @@ def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     for keyword, line in _LINE.findall(text):
         words = number_words(line)
         if keyword in b"vV":
+            if len(words) < 3:
+                raise ValueError(f"vertex {len(vertices) + 1} has {len(words)} coordinates, not 3")
             vertices.append(words[:3])
         elif len(words) > 2:
             index = np.array([int(word.partition(b"/")[0]) for word in words])

@@ -393,7 +393,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     material_N = material_P[vertices:]
     shape = (len(count_T), len(material_N), 3)
     entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)
-    claims.add("frames x particles", *shape[:2], 13)
+    claims.add("frames x points", len(count_T), len(material_P), 13)
     shown_TP = np.concatenate([np.zeros(vertices, np.int64), entry_N]) <= np.arange(shape[0])[:, None]
     if points.shape != (shown_TP.sum(), 3) or (count_T != shown_TP.sum(axis=1)).any():
         raise ConfigError(f"Points must contain {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")

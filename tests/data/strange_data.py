@@ -1,18 +1,16 @@
 """Files that claim far more than they hold: rollouts, particles, imports and manifests."""
 
-import io
 import json
 import os
 import struct
 import tarfile
-import zipfile
 import zlib
 
 import h5py
 import numpy as np
 from data.foreign_writers import metadata, write
+from data.strange_archives import BOMB, PICKLES, zipped
 from data.strange_files import cases, saved
-from data.strange_pickles import key_of_tuples, keys_of_one_hash, laughing
 from data.test_index import shard
 from scene.test_rollout_file import array, attribute, make_rollout, turned
 
@@ -23,7 +21,6 @@ from hgn.data.identity import identity_hash
 from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
 from hgn.scene.rollout_file import read_rollout, write_rollout
-from hgn.scene.scene_file import load_scene
 
 # HDF5 and NumPy archives
 
@@ -66,15 +63,15 @@ def chunked(file):
     file.create_dataset("00000/position", (1,), "f4", **options)
 
 
-def packed(megabytes, filters):
-    """A dataset of 64 numbers, in one chunk that expands to megabytes of zeros."""
+def packed(megabytes, filters, count=64):
+    """A dataset of numbers, 64 unless `count` is given, in one chunk that expands to megabytes of zeros."""
 
     def change(file):
         plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        plan.set_chunk((64,))
+        plan.set_chunk((count,))
         for _ in range(filters):
             plan.set_deflate(9)
-        h5py.h5d.create(file["00000"].id, b"x", h5py.h5t.NATIVE_INT8, h5py.h5s.create_simple((64,)), plan)
+        h5py.h5d.create(file["00000"].id, b"x", h5py.h5t.NATIVE_INT8, h5py.h5s.create_simple((count,)), plan)
         content = zeros(megabytes)
         for _ in range(filters - 1):
             content = zlib.compress(content)
@@ -88,6 +85,20 @@ def zeros(megabytes):
     packer = zlib.compressobj(9, wbits=-15)
     block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
     return b"\x78\xda" + megabytes * block + b"\3\0" + struct.pack(">HH", megabytes * 2**20 % 65521, 1)
+
+
+def filtered(name, code, values=()):
+    """The dataset with a filter, whose code trusts the numbers in the file."""
+
+    def change(file):
+        value = file.pop(name)[()].astype(np.int32)
+        plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plan.set_chunk(value.shape)
+        plan.set_filter(code, h5py.h5z.FLAG_OPTIONAL, values)
+        space = h5py.h5s.create_simple(value.shape)
+        h5py.Dataset(h5py.h5d.create(file.id, name.encode(), h5py.h5t.NATIVE_INT32, space, plan))[...] = value
+
+    return change
 
 
 def crumbs(file):
@@ -129,15 +140,19 @@ def linked_obstacles(file):
         group[f"n{number}"] = one
 
 
-def frames_of_nobody(file):
-    """10^10 places of particles that never enter."""
-    for name, value in {
-        "VTKHDF/NumberOfPoints": np.full(100_000, 7),
-        "VTKHDF/PointData/material": np.zeros(100_000, np.uint8),
-        "VTKHDF/Vertices/Connectivity": np.zeros(100_000, np.int64),
-    }.items():
-        replaced(name, value)(file)
-    file.create_dataset("hgn/entry_frame", data=np.full(100_000, 10**6), compression="gzip")
+def frames(count, particles, vertices=0):
+    """Frames of particles that never enter, and of vertices."""
+
+    def change(file):
+        for name, value in {
+            "VTKHDF/NumberOfPoints": np.full(count, 7),
+            "VTKHDF/PointData/material": np.zeros(particles + vertices, np.uint8),
+            "VTKHDF/Vertices/Connectivity": np.zeros(particles, np.int64),
+        }.items():
+            replaced(name, value)(file)
+        file.create_dataset("hgn/entry_frame", data=np.full(particles, 10**6))
+
+    return change
 
 
 cases(
@@ -162,52 +177,15 @@ cases(
         "attributes": rollout(attributes),
         "loop": rollout(loop),
         "linked obstacles": rollout(linked_obstacles),
-        "frames of nobody": rollout(frames_of_nobody),
+        "frames of nobody": rollout(frames(100_000, 100_000)),
+        "frames of vertices": rollout(frames(60, 0, 40_000_000)),
+        "frames of few particles": rollout(frames(100_000, 1, 30_000)),
+        "scale and offset": rollout(filtered("VTKHDF/PointData/material", h5py.h5z.FILTER_SCALEOFFSET, (2, 4))),
+        "bits": rollout(filtered("VTKHDF/Vertices/Connectivity", h5py.h5z.FILTER_NBIT)),
+        "a filter of others": rollout(filtered("VTKHDF/Vertices/Connectivity", 32015)),
         "triangles": rollout(replaced("hgn/obstacles/0000/triangles", np.tile(np.int32([0, 1, 2]), (5_000_000, 1)))),
     },
     read_rollout,
-)
-
-
-def zipped(members, name="train.npz"):
-    """An archive of arrays of zeros, from their shapes."""
-
-    def make(folder):
-        with zipfile.ZipFile(folder / name, "w", zipfile.ZIP_DEFLATED) as archive:
-            for member, (shape, dtype, held) in members.items():
-                head = io.BytesIO()
-                np.lib.format.write_array_header_1_0(head, {"descr": dtype, "fortran_order": False, "shape": shape})
-                with archive.open(f"{member}.npy", "w", force_zip64=True) as file:
-                    file.write(head.getvalue())
-                    for _ in range(held // 2**20):
-                        file.write(bytes(2**20))
-        return folder / name
-
-    return make
-
-
-def scene_with(particles):
-    def make(folder):
-        particles(folder)
-        path = folder / "s.yaml"
-        path.write_text("groups:\n- {particles: train.npz, material: sand}\n")
-        return path
-
-    return make
-
-
-BOMB = 80 * 2**20
-cases(
-    "particles",
-    {
-        "bomb": scene_with(zipped({"position": ((BOMB // 12, 3), "<f4", BOMB)})),
-        "bomb beside": scene_with(zipped({"other": ((BOMB // 12, 3), "<f4", BOMB)})),
-        "claim": scene_with(zipped({"position": ((10**10, 3), "<f4", 2**20)})),
-        "no axis": scene_with(zipped({"position": ((10**18, 0, 3), "<f4", 0)})),
-        "wide text": scene_with(zipped({"position": ((1,), "<U1000000000", 2**20)})),
-        "many": scene_with(zipped({f"a{number}": ((2**18,), "<f4", 2**20) for number in range(70)})),
-    },
-    load_scene,
 )
 
 
@@ -231,28 +209,6 @@ def h5(name, change):
     return on
 
 
-def filled(value):
-    """An array of one object."""
-    array = np.empty(1, object)
-    array[0] = value
-    return array
-
-
-def objects(value):
-    """A pickled array that refers to a value."""
-    return lambda folder: np.savez(folder / "train.npz", gns_data=filled(value))
-
-
-def raw_pickle(data):
-    def on(folder):
-        head = io.BytesIO()
-        np.lib.format.write_array_header_1_0(head, {"descr": "|O", "fortran_order": False, "shape": (1,)})
-        with zipfile.ZipFile(folder / "train.npz", "w") as archive:
-            archive.writestr("gns_data.npy", head.getvalue() + data)
-
-    return on
-
-
 def tfrecords(folder):
     """A record that claims 2^40 bytes, under a checksum that holds."""
     length = struct.pack("<Q", 2**40)
@@ -272,8 +228,11 @@ cases(
         "large chunks": imported("lagrangebench", h5("train.h5", chunked)),
         "compressed twice": imported("lagrangebench", h5("train.h5", packed(4000, 2))),
         "compressed to more": imported("lagrangebench", h5("train.h5", packed(900, 1))),
+        "compressed to far more": imported("lagrangebench", h5("train.h5", packed(9000, 1, 10_000_000))),
+        "scale and offset": imported(
+            "lagrangebench", h5("train.h5", filtered("00001/particle_type", h5py.h5z.FILTER_SCALEOFFSET, (2, 4)))
+        ),
         "small chunks": imported("lagrangebench", h5("train.h5", crumbs)),
-        "a key of tuples": imported("geoelements", raw_pickle(key_of_tuples())),
         "wide cells": imported("lagrangebench", obstacle_cell_size=1e300),
         "tiny cells": imported("lagrangebench", obstacle_cell_size=5e-324),
         "pipe": imported("neuralmpm", lambda folder: os.mkfifo(folder / "train" / "sim_00.h5")),
@@ -283,16 +242,7 @@ cases(
         "crowd": imported("neuralmpm", h5("train/sim_0.h5", crowded)),
         "npz": imported("plain", zipped({"a/position": ((9, BOMB // 108, 3), "<f4", BOMB)})),
         "object claim": imported("geoelements", zipped({"gns_data": ((10**10,), "|O", 0)})),
-        "references": imported("geoelements", objects((laughing(), np.full(4, 5)))),
-        **{
-            f"{len(parts)} parts": imported("geoelements", objects(tuple(parts)))
-            for parts in ([laughing()], [laughing(), 1, 2, 3])
-        },
-        "references as a trajectory": imported("geoelements", objects(laughing())),
-        "an array of references": imported("geoelements", objects(filled(laughing()))),
-        "keys of one hash": imported("geoelements", raw_pickle(keys_of_one_hash())),
-        "memo": imported("geoelements", raw_pickle(b"\x80\x02}r\xff\xff\xff\x7f.")),
-        "long bytes": imported("geoelements", raw_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 10**11) + b"x.")),
+        **{name: imported("geoelements", change) for name, change in PICKLES.items()},
         "sequence length": imported("deepmind", sequence_length=10**30),
         "repeated key": imported(
             "plain",

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import struct
 
 import numpy as np
@@ -149,14 +150,24 @@ def large_view(header):
     position = header["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     header["meshes"][0]["primitives"] = 5000 * [{"mode": 5, "attributes": {"POSITION": position}}]
     view = {"buffer": 0, "byteOffset": 4, "byteLength": 60 << 20}
-    header |= {"buffers": [{"uri": "m.bin"}], "bufferViews": len(header["bufferViews"]) * [view]}
+    header |= {
+        "buffers": [{"uri": "m.bin", "byteLength": 61 << 20}],
+        "bufferViews": len(header["bufferViews"]) * [view],
+    }
 
 
 def alike_buffers(header):
     """Ninety buffers, all of them one file of 60 MB."""
     header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": i}} for i in range(90)]
     header["accessors"] = [{"bufferView": i, "componentType": 5126, "count": 3, "type": "VEC3"} for i in range(90)]
-    header |= {"buffers": 90 * [{"uri": "m.bin"}], "bufferViews": [{"buffer": i, "byteLength": 36} for i in range(90)]}
+    header["buffers"] = 90 * [{"uri": "m.bin", "byteLength": 60 << 20}]
+    header |= {"bufferViews": [{"buffer": i, "byteLength": 36} for i in range(90)]}
+
+
+def far(folder, size):
+    """A file of 3 GB beside the mesh, without blocks on the disk, and the size that a buffer of it claims."""
+    os.truncate(saved("m.bin", b"")(folder), 3 * 10**9)
+    return glb(lambda header: header["buffers"][0].update(uri="m.bin", byteLength=size))(folder)
 
 
 def empty_primitives(header):
@@ -170,7 +181,7 @@ def no_instances(header):
     """Nodes with 6 * 10^4 primitives of 4 * 10^5 vertices, in no place."""
     count, views = len(header["accessors"]), len(header["bufferViews"])
     header["bufferViews"].append({"buffer": 1, "byteLength": 1_200_000})
-    header["buffers"].append({"uri": "m.bin"})
+    header["buffers"].append({"uri": "m.bin", "byteLength": 1_200_000})
     places = {"bufferView": 0, "componentType": 5126, "count": 0, "type": "VEC3"}
     header["accessors"] += [places, {"bufferView": views, "componentType": 5121, "count": 399_999, "type": "VEC3"}]
     header["meshes"] = [{"primitives": [{"attributes": {"POSITION": count + 1}}] * 6000}]
@@ -258,6 +269,7 @@ cases(
         "stride 0": glb(stride_0),
         "large view": lambda folder: saved("m.bin", bytes(64 << 20))(folder) and glb(large_view)(folder),
         "alike buffers": lambda folder: saved("m.bin", bytes(60 << 20))(folder) and glb(alike_buffers)(folder),
+        **{f"{size} bytes of a file": lambda folder, size=size: far(folder, size) for size in (1000, 3 * 10**9)},
         "long name of a file": glb(lambda header: header["buffers"][0].update(uri=2_000_000 * "=a:b@")),
         "long tree": glb(lambda header: header.update(x=6_000_000 * [[]])),
         "targets": glb(targets),

@@ -149,7 +149,7 @@ REFUSED = [
         for word in (b"surf", b"call", b"fo", b"bzp", b"SURF", b"Call", b"FO", b"\tBZP")
     ),
     ("a.obj", GOOD + b"surf\\\n 1 2 3\n", {}, "contains surf, which is not read"),
-    ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nv 5 5\nv 5 6\nv 6 5\n" + FACE, {}, "readable OBJ file"),
+    *(("a.obj", x + FACE, {}, "has . coordinates, not 3") for x in (b"v 0 0\nv 1 0\nv 0 1\n", GOOD + b"v 1\n")),
     *(
         (f"a.{suffix}", text.decode().encode(name), {}, "it is UTF-16 text")
         for name in ("utf-16", "utf-16-le", "utf-16-be")
