@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from io import BufferedRandom
 from pathlib import Path
 
-from hgn.data.verification import note_verified, verify_file
+from hgn.data.verification import StorageError, note_verified, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system import patience
 from hgn.system.files import TEMPORARY_SUFFIX, sync_folder
@@ -70,13 +70,17 @@ def cached_shard(shard: CachedShard, patience_s: float, spared: Collection[str] 
         if not path.exists():
             _fetch(path, shard, patience_s, spared, fill)
         try:
-            verify_file(path, shard.sha256, shard.size, "it is fetched again")
+            size = path.stat().st_size  # not the claimed one: an index may name another set's shard
+            verify_file(path, shard.sha256, size, "it is fetched again")
             break
         except (ConfigError, FileNotFoundError) as error:  # damaged on this disk, or removed by another process
             if last_try:
                 raise
             print(error, file=sys.stderr)
             path.unlink(missing_ok=True)
+    if size != shard.size:
+        cause = f"got {size} of its sha256: its index is wrong; generate it again"
+        raise StorageError(f"{shard.url} must have {shard.size} bytes, {cause}")
     return path
 
 

@@ -24,7 +24,7 @@ from hgn.data import shard_cache
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, cache_folder
-from hgn.data.storage import TOKEN_VARIABLE, is_remote, open_storage
+from hgn.data.storage import TOKEN_VARIABLE, StorageError, is_remote, open_storage
 from hgn.schema import ConfigError
 from hgn.system.patience import UnreachableError, without_patience
 
@@ -187,6 +187,17 @@ def test_damaged_cache_is_mended(folder, cache, capsys):
     os.utime(path, ns=(1, 1))
     assert brought(url).read_bytes()[:5] == b"train"
     assert "it was altered; it is fetched again" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [512, -512])
+def test_an_index_that_claims_another_size_removes_nothing(folder, cache, more):
+    """A cached shard of another set whose sha256 such an index names stays, and the claim is refused."""
+    url = in_memory(folder, "claimed")
+    path, entry = brought(url), Manifest.load(url).shards[0]
+    claimed = dataclasses.replace(entry, bytes=entry.bytes + more)
+    with pytest.raises(StorageError, match=rf"train-.*\.tar must have {claimed.bytes} bytes, got {entry.bytes} of its"):
+        brought(url, claimed)
+    assert path.read_bytes() == (folder / entry.name).read_bytes()
 
 
 def test_altered_or_cut_shards_are_refused(folder, cache):
