@@ -17,6 +17,7 @@ from hgn.schema import ConfigError, from_mapping, printable, require, require_re
 from hgn.system.extras import missing_extra, require_installed
 from hgn.system.loading import loading
 from hgn.system.locks import locked
+from hgn.system.patience import AwayError, outlived
 from hgn.system.processes import die_with_parent
 from hgn.system.ranks import first_on_machine, first_rank
 
@@ -78,7 +79,8 @@ def main(mapping: dict[str, Any]) -> int:
     with ExitStack() as stack:
         if first_rank():
             stack.enter_context(locked(run / ".lock", "run", "another training is in it; wait for its end, or choose"))
-        resume = _checkpoint_to_resume(config, run / "checkpoints")
+        checkpoints = run / "checkpoints"
+        resume = outlived(lambda: _checkpoint_to_resume(config, checkpoints), checkpoints)
         initial = _initial_network(config, resume)
         generator = None
         # A URL is a service that generates missing episodes itself.
@@ -103,14 +105,15 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
-    """Returns the run's last undamaged checkpoint, or None without any. Call it before other processes start.
+    """Returns the run's last undamaged checkpoint, or None before its first. Call it before other processes start.
 
-    Raises DamagedError if all checkpoints are damaged.
+    Raises DamagedError if all checkpoints are damaged, AwayError if all are missing.
     """
     from hgn.data.identity import dataset_identity, identity_hash
     from hgn.data.manifest import Manifest
     from hgn.training.checkpoint import (
         LAST_NAMES,
+        SAVED,
         DamagedError,
         Progress,
         Resume,
@@ -130,6 +133,11 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
     else:
         if damaged is not None:
             raise damaged
+        if (mark := folder.parent / SAVED).exists():
+            raise AwayError(
+                f"run must be a folder with the checkpoints that it has saved, got none in {folder}; restore them, "
+                f"choose another run=FOLDER, or delete {mark} to begin at update 0"
+            )
         return None
     if config.imported:
         config_hash = Manifest.load(config.dataset.folder).config_hash

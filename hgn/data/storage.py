@@ -70,12 +70,7 @@ def ask(folder: Path | str, read: "Callable[[Storage], T]") -> T:
     storage, place = open_storage(folder), str(folder)
     if _once.get() or not outliving():
         return read(storage)
-    try:
-        return patiently(lambda: read(storage), _may_pass, place, place, standard_patience_s())
-    except UnreachableError as error:
-        if isinstance(error.__cause__, StorageError):  # the storage answers, and the file stays damaged
-            raise error.__cause__ from None
-        raise
+    return patiently(lambda: read(storage), _may_pass, place, place, standard_patience_s())
 
 
 def _may_pass(error: Exception) -> str | None:

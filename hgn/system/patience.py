@@ -24,6 +24,10 @@ T = TypeVar("T")
 without = threading.Event()  # while this is set, no thread waits to read
 
 
+class AwayError(ConfigError):
+    """Files of a run are missing, perhaps temporarily."""
+
+
 class UnreachableError(OSError):
     """Reports a server that did not answer within the patience."""
 
@@ -58,13 +62,14 @@ def without_patience() -> contextlib.AbstractContextManager[None]:
 
 
 def outlived(write: Callable[[], T], path: Path) -> T:
-    """Returns `write()`, and retries it for the standard patience if a file of a run cannot be written.
+    """Returns `write()`, and retries it for the standard patience if a file of a run cannot be written or is away.
 
-    Raises UnreachableError with `path`; at once IsADirectoryError and NotADirectoryError.
+    Raises UnreachableError with `path`, or AwayError; at once IsADirectoryError and NotADirectoryError.
     """
 
     def cause(error: Exception) -> str | None:
-        passing = isinstance(error, OSError) and not isinstance(error, (IsADirectoryError, NotADirectoryError))
+        lasting = isinstance(error, (IsADirectoryError, NotADirectoryError))
+        passing = isinstance(error, (OSError, AwayError)) and not lasting
         return str(error) if passing else None
 
     return patiently(write, cause, str(path), str(path.parent), standard_patience_s(), ended=threading.Event())
@@ -81,7 +86,7 @@ def patiently(
     """Returns `ask()`, and retries it while `passing` returns the cause of its error. None marks a permanent error.
 
     While `ended` is set it does not wait.
-    Raises UnreachableError with `url`, or a permanent error.
+    Raises UnreachableError with `url`, or a permanent error. A ConfigError that stays is raised itself.
     """
     start, pause, warned = time.monotonic(), FIRST_PAUSE_S, False
     while True:
@@ -92,6 +97,8 @@ def patiently(
             if cause is None:
                 raise
             if time.monotonic() - start + pause > patience_s or ended.is_set():
+                if isinstance(error, ConfigError):  # the storage answers, and the file stays damaged
+                    raise
                 raise UnreachableError(url, patience_s, cause) from error
             if not warned and pause > 1:
                 warned = True

@@ -40,6 +40,7 @@ from hgn.system.files import opened
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
+SAVED = ".saved"  # file in the run's folder after its first checkpoint: only a run without it may begin anew
 BEST_NAME = "best.ckpt"  # network with the lowest one-step validation error; no such file before a measurement
 _CALLED = re.compile(
     r"collections OrderedDict|torch (\w+Storage|[a-z]\w+|Size)|torch\._utils _rebuild_(tensor_v2|parameter)"

@@ -5,7 +5,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from concurrent import futures
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
+from hgn.schema import ConfigError
 from hgn.system.files import make_folder, temporary_file, write_atomically
 from hgn.system.locks import make_again
 from hgn.system.patience import outlived
-from hgn.training.checkpoint import LAST_NAMES
+from hgn.training.checkpoint import LAST_NAMES, SAVED, DamagedError, Progress, read_checkpoint
 
 TURN_S = 1e-4  # Python's switch interval during pickling of a checkpoint; the default is 5e-3
 
@@ -33,12 +34,13 @@ class CheckpointWriter(TorchCheckpointIO):
     def __init__(self) -> None:
         self._thread = futures.ThreadPoolExecutor(1, "checkpoint")
         self._writing: futures.Future[None] | None = None
+        self._earlier = set[tuple[int, int]]()  # identities of checkpoints that may be replaced
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Returns when the checkpoint is copied. Raises: OSError if the previous write failed."""
         self.wait()
         copy, place = snapshot(checkpoint), Path(path)
-        self._writing = self._thread.submit(outlived, lambda: _write(copy, place), place)
+        self._writing = self._thread.submit(outlived, lambda: _write(copy, place, self._earlier), place)
 
     def wait(self) -> None:
         """Returns when the last checkpoint is on disk. Raises: OSError if it could not be written."""
@@ -87,15 +89,41 @@ def _keep_earlier(folder: Path) -> None:
                 temporary.replace(folder / earlier)
 
 
-def _write(checkpoint: dict[str, Any], path: Path) -> None:
+def _identity(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
+
+
+def _require_none_later(checkpoint: dict[str, Any], folder: Path, earlier: set[tuple[int, int]]) -> None:
+    """Raises ConfigError if the folder has a checkpoint of a later update, which was away when this run started.
+
+    It adds the identities of the others to `earlier`, and reads none of these again.
+    """
+    for path in (folder / name for name in LAST_NAMES):
+        with suppress(FileNotFoundError, DamagedError):
+            if (identity := _identity(path)) not in earlier:
+                own, theirs = (Progress.of(one).updates for one in (checkpoint, read_checkpoint(path)))
+                if theirs > own:
+                    raise ConfigError(
+                        f"run must be a folder without checkpoints after update {own}, got {path} of update {theirs}; "
+                        "start again to resume from it, or choose another run=FOLDER"
+                    )
+                earlier.add(identity)
+
+
+def _write(checkpoint: dict[str, Any], path: Path, earlier: set[tuple[int, int]]) -> None:
     make_again(path.parent.parent)
     make_folder(path.parent)
+    _require_none_later(checkpoint, path.parent, earlier)
     content = io.BytesIO()
     with _short_turns():
         torch.save(checkpoint, content)
     if path.name == LAST_NAMES[0]:
         _keep_earlier(path.parent)
     write_atomically(path, content.getvalue())
+    if path.name == LAST_NAMES[0]:
+        earlier.add(_identity(path))
+        (path.parent.parent / SAVED).touch()
 
 
 @contextmanager

@@ -378,6 +378,55 @@ def test_a_run_whose_folder_is_another_trainings(data, tmp_path, monkeypatch, ev
     os.close(*other)
 
 
+def without_checkpoints(run):
+    """The run, whose checkpoints have another name for a while."""
+    return renamed("checkpoints")(run)
+
+
+def test_checkpoints_that_are_away_at_the_start(finished, capsys, monkeypatch):
+    """The start waits for the checkpoints that a run has saved. If they stay away, it is refused, and it begins anew
+    without the mark that the refusal names. A run that was killed before its first checkpoint begins anew."""
+    data, run = finished
+    fault = without_checkpoints(run)
+    fault.__enter__()
+    timer = threading.Timer(0.3, fault.__exit__, (None, None, None))
+    timer.start()
+    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
+    timer.join()
+    assert "resuming at update 12" in capsys.readouterr().err and metrics(run)[-1]["update"] == 16
+    monkeypatch.setenv(VARIABLE, "0")
+    with without_checkpoints(run):
+        with pytest.raises(ConfigError, match=r"run must be a folder with the checkpoints .* delete .*run/\.saved to"):
+            train.main(train_mapping(data, run))
+        assert metrics(run)[-1]["update"] == 16
+        (run / ".saved").unlink()
+        assert train.main(train_mapping(data, run, maximum_updates=1, checkpoint_every=100)) == 0
+        (run / "checkpoints").rename(run / "new")
+
+
+@pytest.mark.parametrize("changes", [{}, {"checkpoint_every": 100}, {"checkpoint_every": 100, "monitor_every": 2}])
+@pytest.mark.parametrize("names", [LAST_NAMES, LAST_NAMES[1:]])
+def test_no_save_replaces_a_later_checkpoint(finished, monkeypatch, changes, names):
+    """Checkpoints of later updates that come back while a training runs stay as they are, and it ends with a line."""
+    data, run = finished
+    (run / ".saved").unlink(missing_ok=True)
+    for name in set(LAST_NAMES) - set(names):
+        (run / "checkpoints" / name).unlink()
+    kept = {path.name: path.read_bytes() for path in (run / "checkpoints").iterdir()}
+    fault, started = without_checkpoints(run), callbacks.Checkpoints.on_train_start
+
+    def back(checkpoints, *rest):
+        started(checkpoints, *rest)
+        fault.__exit__(None, None, None)
+
+    monkeypatch.setattr(callbacks.Checkpoints, "on_train_start", back)
+    fault.__enter__()
+    rule = r"run must be a folder without checkpoints after update \d, got .*ckpt of update 1\d; start again"
+    with pytest.raises(ConfigError, match=rule):
+        train.main(train_mapping(data, run, maximum_updates=8, **changes))
+    assert {path.name: path.read_bytes() for path in (run / "checkpoints").iterdir()} == kept
+
+
 def test_a_run_in_a_mounted_bucket(data, tmp_path, monkeypatch):
     """Mounted object stores may have no hard links, no locks and no truncation. A run does without, and a line of
     metrics that was cut is removed as ever."""
