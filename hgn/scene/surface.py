@@ -41,7 +41,7 @@ def sample_surface(
     if not expected < most:
         raise ConfigError(
             f"obstacle surface must need fewer than {most} samples at spacing {spacing:g}, got "
-            f"{expected:.3g}; scale the mesh down, cut away what lies outside the domain, or raise cell_size"
+            f"{expected:.3g}; scale it down, remove others, cut away what lies outside the domain, or raise cell_size"
         )
     candidate_count = int(expected) + MINIMUM_CANDIDATES
     points, owners = np.zeros((0, 3)), np.zeros(0, np.int64)

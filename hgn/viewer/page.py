@@ -39,6 +39,7 @@ BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
 TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
+ACTIONS_S = 0.1  # the next frame comes before the actions that follow once actions have taken this time
 ABOUT = {
     "mechanics": "any motion and gravity; free flight is exact",
     "own_physics": "pools, dams, slopes, small and large bodies; resting material creeps",
@@ -97,10 +98,21 @@ class PlayPage:
             if len(self.actions) < MAXIMUM_ACTIONS:
                 self.actions[key] = action, client
 
-    def _do_all(self) -> bool:
-        with self._queueing:
-            latest, self.actions = self.actions, {}
-        for action, client in latest.values():
+    def _present(self, client: viser.ClientHandle | None) -> list[Any]:
+        """Returns a viewer, or all viewers, without those who have left. viser warns of messages to these."""
+        clients = self.server.get_clients()
+        return list(clients.values()) if client is None else [client][: client.client_id in clients]
+
+    def _do_some(self) -> bool:
+        """Runs waiting actions of present viewers until they have taken ACTIONS_S. Returns whether there were any."""
+        begin, any_waited = time.monotonic(), bool(self.actions)
+        while self.actions and time.monotonic() - begin < ACTIONS_S:
+            with self._queueing:
+                key = next(iter(self.actions))
+                action, client = self.actions.pop(key)
+            left = client is not None and not self._present(client)
+            if left and key != "pour":  # it may close the spout
+                continue
             before = self.session.undoable
             try:
                 action()
@@ -111,10 +123,10 @@ class PlayPage:
             except Exception as error:  # noqa: BLE001
                 traceback.print_exception(error, file=sys.stderr)
                 self._notify(f"failed: {type(error).__name__}: {error}", client)
-        return bool(latest)
+        return any_waited
 
     def _notify(self, message: str, client: viser.ClientHandle | None = None) -> None:
-        for one in [client] if client is not None else list(self.server.get_clients().values()):
+        for one in self._present(client):
             updates(partial(one.add_notification, "HGN", message, auto_close_seconds=10))
 
     def run(self) -> None:
@@ -122,7 +134,7 @@ class PlayPage:
         due = updated = time.monotonic()
         frames, shown = 0, True
         while not self.ended.is_set():
-            changed = self._do_all() or not shown
+            changed = self._do_some() or not shown
             if (self.playing and self.server.get_clients()) or self.steps:
                 self.steps = max(0, self.steps - 1)
                 try:

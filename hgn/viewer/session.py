@@ -25,6 +25,7 @@ from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
+from hgn.scene.surface import point_tree
 from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping, triple
 from hgn.viewer.placed import Body, PlacedObstacle, moved_from, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
@@ -32,7 +33,7 @@ from hgn.viewer.recording import Frame, Recording
 CLEARANCE = 1.25  # least distance of an entering particle from all others, in spacings of particles at rest
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
 MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of mesh files, those of past frames included
-MOST_SAMPLES = 600_000  # surface samples of an added mesh: about 4 CPU seconds, in which the page stands still
+MOST_SAMPLES = 600_000  # surface samples of all added obstacles: about 4 CPU seconds, in which the page stands still
 CHANGES = 100  # largest number of changes that can be undone
 FULL_SHARE = 0.5  # the spout waits while more than this fraction of the particles of one frame are still near it
 
@@ -257,7 +258,8 @@ class PlaySession:
         """Adds an obstacle of a shape, or of a mesh file in a folder. Raises ConfigError as a scene file does."""
         rule, count = f"at most {MAXIMUM_OBSTACLES}", len(self.obstacles) + 1
         require(count <= MAXIMUM_OBSTACLES, "obstacles", rule, count, "remove one")
-        placed = placed_by(entry, folder, self.cell_size, MOST_SAMPLES)
+        taken = sum(len(obstacle.samples[0]) for obstacle in self.obstacles if obstacle.body in self._bodies)
+        placed = placed_by(entry, folder, self.cell_size, MOST_SAMPLES - taken)
         size = sum(len(body.mesh_file or b"") for body in {*self._bodies, placed.body})
         require(size <= MAXIMUM_MESH_BYTES, "mesh files", f"at most {MAXIMUM_MESH_BYTES} bytes", size, "restart")
         self._bodies.add(placed.body)
@@ -280,13 +282,14 @@ class PlaySession:
         taken_A3 = np.concatenate([self.newest.position_N3, *surfaces])
         domain, middle = np.array(self.domain_size), np.array([0.5, 0.3, 0.5])
         share_C3 = np.stack(np.meshgrid(*[np.linspace(0.1, 0.9, 9)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        for share_3 in (middle, *share_C3[np.linalg.norm(share_C3 - middle, axis=1).argsort(kind="stable")]):
-            centre = share_3 * domain
-            if (np.abs(centre - 0.5 * domain) + 0.5 * size > 0.5 * domain + 1e-9).any():
-                continue  # a part of it would be beyond a wall
-            if not (np.abs(taken_A3 - centre) < 0.5 * size + self.cell_size).all(axis=1).any():
-                return triple(centre)
-        raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; use a smaller one")
+        order_C = np.linalg.norm(share_C3 - middle, axis=1).argsort(kind="stable")
+        centre_C3 = np.concatenate([middle[None], share_C3[order_C]]) * domain
+        inside_C = (np.abs(centre_C3 - 0.5 * domain) + 0.5 * size <= 0.5 * domain + 1e-9).all(axis=1)
+        distance_C, _ = point_tree(taken_A3).query(centre_C3, p=np.inf)  # infinite without points
+        free_C = inside_C & (distance_C >= 0.5 * size + self.cell_size)
+        if not free_C.any():
+            raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; use a smaller one")
+        return triple(centre_C3[free_C.argmax()])
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
         """Replaces the obstacle of the same body, if it is still there. Raises ConfigError for a place far outside."""

@@ -151,7 +151,7 @@ def test_errors():
     far = Obstacle("far", tiny.vertex_V3 + 1e9, tiny.triangle_F3, closed=False)
     with pytest.raises(ConfigError, match=r"within 2\^31 cells"):
         build_obstacle_grid([far], 1e-2, 0)
-    with pytest.raises(ConfigError, match="scale the mesh down"):
+    with pytest.raises(ConfigError, match="scale it down"):
         sample_surface(1e6 * tiny.corners, CELL / 4, rng())
     with pytest.raises(ConfigError, match=r"fewer than 3000000 samples at spacing .*, got 3.72e"):
         build_obstacle_grid([shape_obstacle("half_box", 8.7, (4.4, 4.4, 4.4))], 1 / 32, 0, (9.0, 9.0, 9.0))

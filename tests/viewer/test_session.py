@@ -260,6 +260,18 @@ def test_free_places_are_inside_the_domain(middle, size):
         raise AssertionError("the domain is never full")
 
 
+def test_samples_of_added_obstacles_are_bounded(session, monkeypatch):
+    """They count together, because a change may need them all. Those of removed obstacles do not count."""
+    entry = ObstacleEntry(shape="cone", size=0.1, position=(0.5, 0.5, 0.5))
+    most = 10 * len(session.add_obstacle(entry).samples[0])
+    monkeypatch.setattr("hgn.viewer.session.MOST_SAMPLES", most)
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=r"surface must need fewer than .* remove others"):
+            for _ in range(10):
+                session.add_obstacle(entry)
+        session.restart()
+
+
 def test_what_is_kept_is_bounded(session):
     """Frames beyond the limit are forgotten, going back to them is refused with the frames that are kept, and the
     oldest that is kept repeats to the bit."""

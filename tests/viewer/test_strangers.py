@@ -35,7 +35,7 @@ TRIANGLES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2
 def sent(page, action):
     """Runs a viewer's actions, as the page's loop does."""
     page.do(action)
-    page._do_all()
+    page._do_some()
     page._show()
     page._show_status()
 
@@ -157,7 +157,7 @@ def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, cap
     done = []
     page.do(fail)
     page.do(lambda: done.append(True))
-    page._do_all()
+    page._do_some()
     assert len(messages) == 1 and type(error).__name__ in messages[0]
     assert done and type(error).__name__ in capsys.readouterr().err
 
@@ -271,8 +271,34 @@ def test_actions_that_wait_are_bounded(page, messages):
     done = []
     for number in range(10_000):
         page.do(lambda number=number: done.append(number))
-    page._do_all()
+    page._do_some()
     assert done == list(range(64))
+
+
+def test_frames_follow_each_action_that_takes_long(page, messages, monkeypatch):
+    """Actions wait for the next frame once those before it have taken their time. Later ones keep their order."""
+    done, clock = [], [0.0]
+
+    def action(number):
+        clock[0] += 0.03
+        done.append(number)
+
+    monkeypatch.setattr("hgn.viewer.page.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    for number in range(9):
+        page.do(lambda number=number: action(number))
+    for count in (4, 8, 9):
+        assert page._do_some() and done == list(range(count))
+    assert not page._do_some()
+
+
+def test_actions_of_viewers_who_left_are_dropped(page, messages, monkeypatch):
+    """The end of pouring is not among them, because the spout would stay open."""
+    done, (present, away) = [], (SimpleNamespace(client_id=number) for number in (1, 2))
+    monkeypatch.setattr(page.server, "get_clients", lambda: {1: present})
+    for client, key in ((present, None), (away, None), (away, "gravity"), (away, "pour"), (None, "other")):
+        page.do(lambda client=client, key=key: done.append((client, key)), client, key)
+    page._do_some()
+    assert done == [(present, None), (away, "pour"), (None, "other")]
 
 
 def test_a_frame_that_fails_pauses(page, messages, monkeypatch, capsys):
@@ -325,7 +351,7 @@ def test_who_takes_no_file_gets_no_other(page, messages):
     event = SimpleNamespace(client=SimpleNamespace(_websock_connection=connection, send_file_download=send))
     for action in 2 * (page._send_scene, page._send_rollout):
         page.do(lambda action=action: action(event))
-    page._do_all()
+    page._do_some()
     assert sent == ["scene.zip"] and len(messages) == 3 and "download must be complete" in messages[0]
 
 
