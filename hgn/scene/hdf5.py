@@ -138,8 +138,9 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
             if item.size and written < count and plan.fill_value_defined() != h5py.h5d.FILL_VALUE_USER_DEFINED:
                 raise ConfigError(f"{path}: {item.name} must be written as a whole, got {written} of {count} chunks")
             more = packed > 1 or (packed and stored > 2 * count * size + (1 << 16))
-            if more or (packed and filters[-1][0] == h5py.h5z.FILTER_SHUFFLE) or _expands(item, size):
-                rule = f"compressed once, as the last step, from its {count * size} bytes to fewer"
+            shuffled = any(number == h5py.h5z.FILTER_SHUFFLE for number, _ in filters[1:])
+            if more or (packed and shuffled) or _expands(item, size):
+                rule = f"shuffled first and compressed once, from its {count * size} bytes to fewer"
                 raise ConfigError(f"{path}: {item.name} must be {rule}, got {len(filters)} filters, {stored} bytes")
 
 

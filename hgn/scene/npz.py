@@ -105,7 +105,7 @@ def _read_archive(file: BinaryIO, path: Path | BinaryIO, objects: bool) -> Itera
                     raise ConfigError(f"{path}: {member} must be an array (.npy), as numpy.savez writes it")
                 with archive.open(info) as content:
                     data = content.read(info.file_size)  # without a size zipfile expands a longer stream first
-                yield member, _read_array(data, f"{path}: {member}", objects)
+                yield member, _read_array(data, f"{path}: {member}", claims if objects else None)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise ConfigError(f"{path} must be a complete NumPy archive, got {error}; fetch it again") from None
 
@@ -135,16 +135,16 @@ def _size(archive: zipfile.ZipFile) -> int:
     return archive.fp.seek(0, io.SEEK_END)
 
 
-def _read_array(data: bytes, name: str, objects: bool) -> np.ndarray:
+def _read_array(data: bytes, name: str, claims: Claims | None) -> np.ndarray:
     file = io.BytesIO(data)
     shape, fortran_order, dtype = read_header(file, name)
     try:
         if not dtype.hasobject:
             flat = np.frombuffer(data, dtype, math.prod(shape), file.tell()) if 0 not in shape else np.empty(0, dtype)
             return flat.reshape(shape, order="F" if fortran_order else "C")
-        if not objects:
+        if claims is None:
             raise pickle.UnpicklingError("a pickle")
-        require_plain_pickle(data[file.tell() :])
+        require_plain_pickle(data[file.tell() :], claims)
         array = _ArraysAlone(file).load()
     except _ERRORS as error:
         raise ConfigError(f"{name} must be an array, or a pickle of arrays only, got {error}") from None

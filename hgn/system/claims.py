@@ -11,6 +11,7 @@ from hgn.schema import ConfigError
 
 SMALL_BYTES = 64 << 20  # bytes that any file may claim
 EXPANSION = 100  # bytes that a byte of a larger file may claim: arrays of zeros compress well
+ITEM_BYTES = 400  # bytes that an operation of a pickle counts as, because each takes time, and so does an item
 MOST_ITEMS = 10_000_000  # largest number of items of nested lists, with references resolved
 
 
@@ -20,57 +21,70 @@ class Claims:
     def __init__(self, file: Path | str, file_bytes: int | None = None) -> None:
         self._file = file
         self._file_bytes = Path(file).stat().st_size if file_bytes is None else file_bytes
-        self._most = max(SMALL_BYTES, EXPANSION * self._file_bytes)
-        self._sum = 0
+        self._most = self.left = max(SMALL_BYTES, EXPANSION * self._file_bytes)
 
     def add(self, name: object, *counts: int) -> None:
         """Adds the product of `counts`. The last count is the size of an item.
 
         Raises ConfigError with the file and `name` when the sum exceeds the possible content of the file.
         """
-        self._sum += math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self._most + 1
-        if self._sum > self._most:
+        self.left -= math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self._most + 1
+        if self.left < 0:
             raise ConfigError(
                 f"{self._file}: {name} must keep the content within {self._most} bytes, because the file has "
                 f"{self._file_bytes}, got {' x '.join(map(str, counts))[:200]} more; write or fetch the file again"
             )
 
 
-def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*")) -> None:
+def require_plain_pickle(data: bytes, claims: Claims, names: re.Pattern[str] = re.compile(".*")) -> None:
     """Checks the sizes in a pickle, for which Python allocates memory at once, its calls (`module name`), and its keys.
 
+    Adds to `claims` its operations, and its references with all items and texts of what they refer to.
     Raises ValueError or LookupError for a pickle that is cut, has a memo larger than itself, calls other names than
-    `names`, contains a tuple of more than MOST_ITEMS, references resolved, or a set, a key of several items, or an
-    integer of more than 64 bits: many keys could have one hash, and each would be compared with all others.
+    `names`, or contains a copy, a set, a key of several items, or an integer of more than 64 bits: many keys could have
+    one hash, and each would be compared with all others.
     """
-    stack: list[int | None] = []  # number of items of each object; None: a mark; 0: the class OrderedDict
-    memo: dict[int, int | None] = {}
+    # a list for each object, shared by its references, with the bytes that it counts as, negative without items; None:
+    # a mark; 0: the class OrderedDict
+    stack: list[list[int] | None] = []
+    memo: dict[int, list[int] | None] = {}
+    total = 0
     for operation, argument, _ in pickletools.genops(data):
-        if "PUT" in operation.name and int(argument or 0) > len(data):
+        name, text = operation.name, argument if isinstance(argument, (bytes, bytearray, str)) else b""
+        total += ITEM_BYTES
+        if total > claims.left:
+            claims.add("its pickle", total)
+        if "PUT" in name and int(argument or 0) > len(data):
             raise ValueError(f"a memo of {argument} objects in a pickle of {len(data)} bytes")
         if isinstance(argument, int) and argument.bit_length() > 64:
             raise ValueError(f"an integer of {argument.bit_length()} bits")
-        if operation.name in ("GLOBAL", "STACK_GLOBAL", "INST") and names.fullmatch(str(argument)) is None:
+        if name in ("GLOBAL", "STACK_GLOBAL", "INST") and names.fullmatch(str(argument)) is None:
             raise ValueError(f"{argument}, which is not a part of it")
-        if "GET" in operation.name:
+        if "GET" in name:
             stack.append(memo[int(argument or 0)])
-        elif "PUT" in operation.name or operation.name == "MEMOIZE":
+            total += abs((stack[-1] or [0])[0])
+        elif "PUT" in name or name == "MEMOIZE":
             memo[int(argument) if argument is not None else len(memo)] = stack[-1]
-        elif operation.name == "GLOBAL" and argument == "collections OrderedDict":
-            stack.append(0)
+        elif name == "GLOBAL" and argument == "collections OrderedDict":
+            stack.append([0])
         else:
-            before, items = operation.stack_before, list[int | None]()  # from the top of the stack
+            before, items = operation.stack_before, list[list[int] | None]()  # from the top of the stack
             if pickletools.markobject in before:
                 items, before = list(iter(stack.pop, None)), before[:-2]
-            items += [stack.pop() or 0 for _ in before]
-            sizes = [size or 0 for size in items]
-            if sum(sizes) > MOST_ITEMS:
-                raise ValueError(_too_many())
-            pairs = operation.name == "REDUCE" and sizes[1] == 0 and sizes[0] > 1
-            key = operation.name in ("SETITEM", "SETITEMS", "DICT") and max(sizes[1::2], default=1) > 1
-            if pairs or key or operation.name in ("ADDITEMS", "FROZENSET"):
-                raise ValueError("a key of several items, or a set")
-            stack += [None if kind is pickletools.markobject else 1 + sum(sizes) for kind in operation.stack_after]
+            items += [stack.pop() for _ in before]
+            sizes = [(item or [0])[0] for item in items]
+            pairs = name == "REDUCE" and sizes[1] == 0 and sizes[0] > 0
+            key = name in ("SETITEM", "SETITEMS", "DICT") and max(sizes[1::2], default=0) > 0
+            if pairs or key or name in ("ADDITEMS", "FROZENSET", "DUP"):
+                raise ValueError("a key of several items, a set, or a copy")
+            size = sum(map(abs, sizes)) + ITEM_BYTES + len(text)
+            if name in ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "BUILD") and items[-1]:
+                items[-1][0] = size
+                stack.append(items[-1])
+            else:
+                own = [size if items else -size]
+                stack += [None if kind is pickletools.markobject else own for kind in operation.stack_after]
+    claims.add("its pickle", total)
 
 
 def require_few_items(value: Any) -> None:

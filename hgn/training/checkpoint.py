@@ -141,7 +141,7 @@ def _read(path: Path, file: BinaryIO) -> Any:
                 if record.compress_type != zipfile.ZIP_STORED:
                     raise ValueError(f"{record.filename} is compressed")
                 if name.endswith("/data.pkl"):
-                    require_plain_pickle(records.read(record), _CALLED)
+                    require_plain_pickle(records.read(record), claims, _CALLED)
             if (damaged := records.testzip()) is not None:
                 raise zlib.error(f"{damaged} has a wrong CRC")
         file.seek(0)

@@ -1,6 +1,7 @@
 """NumPy archives that claim far more than they hold, or take far more time."""
 
 import io
+import pickle
 import struct
 import zipfile
 import zlib
@@ -83,14 +84,29 @@ def objects(value):
     return lambda folder: np.savez(folder / "train.npz", gns_data=filled(value))
 
 
-def raw_pickle(data):
+def raw_pickle(data, members=1):
     def on(folder):
         head = io.BytesIO()
         np.lib.format.write_array_header_1_0(head, {"descr": "|O", "fortran_order": False, "shape": (1,)})
-        with zipfile.ZipFile(folder / "train.npz", "w") as archive:
-            archive.writestr("gns_data.npy", head.getvalue() + data)
+        with zipfile.ZipFile(folder / "train.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+            for number in range(members):
+                content = head.getvalue() + (data() if callable(data) else data)
+                archive.writestr(f"gns_data{number or ''}.npy", content)
 
     return on
+
+
+TEXT, WALK = 600_000, np.full((9, 4, 3), 0.5, np.float32)
+WHOLE = pickle.dumps(filled((WALK, np.full(4, 5))), protocol=4)
+
+
+def copies(after=b""):
+    """Twelve thousand arrays that have one text as their bytes, in the other byte order, and what follows on each."""
+    kind = b"cnumpy\ndtype\nX\2\0\0\0i2K\0K\1\x87R(K\3X\1\0\0\0>NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb"
+    shape, text = b"K\1J" + struct.pack("<i", TEXT // 2) + b"\x85", b"B" + struct.pack("<I", TEXT) + bytes(TEXT)
+    function, arguments = b"cnumpy.core.multiarray\n_reconstruct\n", b"cnumpy\nndarray\nK\0\x85C\1b\x87"
+    parts = b"(" + shape + kind + b"\x89" + text + b"tq\0" + function + b"q\1" + arguments + b"q\2"
+    return b"\x80\4" + parts + b"](" + 12_000 * (b"h\1h\2Rh\0b" + after) + b"e."
 
 
 PICKLES = {
@@ -102,4 +118,11 @@ PICKLES = {
     **{f"{len(parts)} parts": objects(tuple(parts)) for parts in ([laughing()], [laughing(), 1, 2, 3])},
     "references as a trajectory": objects(laughing()),
     "an array of references": objects(filled(laughing())),
+    "operations": raw_pickle(lambda: b"\x80\2" + 31_000_000 * b"N0" + b"N."),
+    "operations of many arrays": raw_pickle(lambda: b"\x80\4" + 1_000_000 * b"N0" + WHOLE[2:], members=30),
+    "arrays of one text": raw_pickle(copies()),
+    "unused arrays of one text": raw_pickle(copies(b"\x940")),
+    "references to bytes": objects((WALK, 12_000 * [bytes(TEXT)])),
+    "references to a text": objects((WALK, 3000 * [TEXT * "x"])),
+    "references to an array": objects((12_000 * [np.zeros(TEXT)], 5)),
 }
