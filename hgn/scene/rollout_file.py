@@ -52,6 +52,7 @@ FARTHEST = 1000  # largest coordinate of particles in a file, in domain sizes; a
 KINDS = {"VTKHDF/Points": "f", "VTKHDF/NumberOfPoints": "iu", "hgn/reference": "f", "hgn/entry_frame": "iu"}
 TRIANGLE_BYTES = 1000  # about the memory that a picture takes for a triangle
 FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
+POINTS_OF_A_WRITE = 1_000_000  # points of the frames that are in memory together; each takes about 100 bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,14 +240,20 @@ class _GrowingFile:
 
     def write(self, end: int) -> None:
         """Writes the frames before `end` that are not in the file. A repeated call completes an interrupted one."""
+        points = self._rollout.particle_count + sum(len(obstacle.vertex_V3) for obstacle in self._rollout.obstacles)
+        step = max(1, POINTS_OF_A_WRITE // max(1, points))
+        for before in range(self.count, max(end, self.count + 1), step):
+            self._append(min(before + step, end), points)
+
+    def _append(self, end: int, most_points: int) -> None:
         rollout, begin = self._rollout, self.count
         start, again = max(begin - 2, 0), max(begin - 1, 0)  # a velocity in frame `again` may depend on the next frame
         position_TN3 = rollout.position_TN3[start:end]
         vertex_TV3, triangle_F3, _ = _triangles(rollout.obstacles, np.arange(start, end) / rollout.frame_rate_hz)
-        entry_N = None if rollout.entry_frame_N is None else rollout.entry_frame_N - start
-        velocity_TN3 = frame_velocity(position_TN3, rollout.frame_rate_hz, entry_N)
+        entry_N = np.zeros(rollout.particle_count, int) if rollout.entry_frame_N is None else rollout.entry_frame_N
+        velocity_TN3 = frame_velocity(position_TN3, rollout.frame_rate_hz, entry_N - start)
         velocity_TV3 = frame_velocity(vertex_TV3, rollout.frame_rate_hz)
-        present_T = np.array([rollout.present(frame) for frame in range(end)], np.int64)
+        present_T = np.searchsorted(entry_N, np.arange(end), side="right")
         points_T = present_T + vertex_TV3.shape[1]
         before_T = np.cumsum([0, *points_T])
         for name, frame, value_TV3, value_TN3 in (
@@ -254,7 +261,7 @@ class _GrowingFile:
             ("PointData/velocity", again, velocity_TV3, velocity_TN3),
         ):
             row_R3 = _stacked(value_TV3[frame - start :], value_TN3[frame - start :], present_T[frame:])
-            _extend(self._group, name, row_R3, int(before_T[frame]), int(points_T.max()))
+            _extend(self._group, name, row_R3, int(before_T[frame]), most_points)
         for name, value_T in _numbers(present_T, points_T, len(triangle_F3), rollout).items():
             _extend(self._group, name, value_T[begin:], begin, FRAMES_OF_A_CHUNK)
         self._group["Steps"].attrs["NSteps"] = np.int64(end)
@@ -266,9 +273,8 @@ class _GrowingFile:
 def _extend(group: h5py.Group, name: str, value: np.ndarray, at: int, chunk: int) -> None:
     """Writes rows from row `at` to the end of a dataset, which grows."""
     if name not in group:
-        shape = (0, *value.shape[1:])
-        chunks = (min(max(chunk, 1), 1 << 16), *value.shape[1:])
-        group.create_dataset(name, shape, value.dtype, maxshape=(None, *shape[1:]), chunks=chunks)
+        rest, chunk = value.shape[1:], min(max(chunk, 1), 1 << 16)
+        group.create_dataset(name, (0, *rest), value.dtype, maxshape=(None, *rest), chunks=(chunk, *rest))
     group[name].resize(at + len(value), 0)
     group[name][at:] = value
 
@@ -323,15 +329,12 @@ def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.
         places.append(np.stack([obstacle.at(time).vertex_V3 for time in time_T]).astype(np.float32))
         triangles.append(obstacle.triangle_F3.astype(np.int64) + first)
         first += len(obstacle.vertex_V3)
-    counts = [len(obstacle.triangle_F3) for obstacle in obstacles]
-    number_F = np.repeat(np.arange(len(obstacles), dtype=np.int32), counts)
+    number_F = np.repeat(np.arange(len(obstacles), dtype=np.int32), [len(one.triangle_F3) for one in obstacles])
     return np.concatenate(places, axis=1), np.concatenate(triangles), number_F
 
 
 def _stacked(value_TV3: np.ndarray, value_TN3: np.ndarray, present_T: np.ndarray) -> np.ndarray:
     """Returns the rows of the vertices and of the present particles, frame by frame, float32 [rows, 3]."""
-    if not value_TV3.shape[1] and (present_T == value_TN3.shape[1]).all():
-        return value_TN3.reshape(-1, 3).astype(np.float32, copy=False)
     parts = zip(value_TV3, value_TN3, present_T, strict=True)
     rows = [part for row_V3, row_N3, count in parts for part in (row_V3, row_N3[:count])]
     return np.concatenate(rows or [value_TN3[:0].reshape(0, 3)]).astype(np.float32, copy=False)
@@ -342,10 +345,8 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
     group.attrs["format_version"] = FORMAT_VERSION
     group.attrs["materials"] = json.dumps(rollout.materials)
     group.attrs["dimensions"] = rollout.dimensions
-    group.attrs["frame_rate_hz"] = float(rollout.frame_rate_hz)
-    group.attrs["domain_size"] = np.array(rollout.domain_size, np.float64)
-    group.attrs["gravity"] = np.array(rollout.gravity, np.float64)
-    group.attrs["cell_size"] = float(rollout.cell_size)
+    for name in ("frame_rate_hz", "domain_size", "gravity", "cell_size"):
+        group.attrs[name] = np.array(getattr(rollout, name), np.float64)
     group["source"] = json.dumps(rollout.source)  # a dataset, because attributes are limited to 64 KiB
     obstacles = group.create_group("obstacles")
     for index, obstacle in enumerate(rollout.obstacles):

@@ -14,6 +14,9 @@ from hgn.scene.rollout_file import Rollout
 from hgn.schema import Vector, require
 from hgn.viewer.placed import PlacedObstacle
 
+FRAME_BYTES, PLACE_BYTES = 300, 600  # of a frame without its arrays, and of a place of an obstacle
+SAVED_BYTES = 24  # of a point in each frame of a rollout file: its position and velocity
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -26,7 +29,11 @@ class Frame:
 
     @property
     def bytes(self) -> int:
-        return self.position_N3.nbytes + self.velocity_N3.nbytes
+        return self.position_N3.nbytes + self.velocity_N3.nbytes + FRAME_BYTES
+
+    def bytes_before(self, after: "Frame") -> int:
+        """Returns the bytes of places of obstacles that only this frame and earlier ones need."""
+        return PLACE_BYTES * len({*self.obstacles} - {*after.obstacles})
 
 
 class Recording:
@@ -62,10 +69,13 @@ class Recording:
 
     def append(self, frame: Frame) -> None:
         """Adds the next frame, and drops old frames above the limit."""
+        if self.frames:
+            self.bytes += self.frames[-1].bytes_before(frame)
         self.frames.append(frame)
         self.bytes += frame.bytes
         while self.bytes > self.limit_bytes and len(self.frames) > self.entry_NM3.shape[1] + 1:
-            self.bytes -= self.frames.popleft().bytes
+            oldest = self.frames.popleft()
+            self.bytes -= oldest.bytes + oldest.bytes_before(self.frames[0])
             self.first += 1
 
     def __getitem__(self, frame: int) -> Frame:
@@ -92,25 +102,32 @@ class Recording:
     def back_to(self, frame: int) -> None:
         """Deletes all frames after `frame`, and the particles that entered in them."""
         while self.last > frame:
-            self.bytes -= self.frames.pop().bytes
+            newest = self.frames.pop()
+            self.bytes -= newest.bytes + self.frames[-1].bytes_before(newest)
         count = len(self[frame].position_N3)
         self.entered_N, self.material_N = self.entered_N[:count], self.material_N[:count]
         self.entry_NM3 = self.entry_NM3[:count]
 
     def rollout(self, domain_size: Vector, frame_rate_hz: float, cell_size: float, source: dict[str, str]) -> Rollout:
-        """Returns all frames that are kept, with the entry frame of each particle.
+        """Returns the newest frames, with the entry frame of each particle. Their file is within `limit_bytes`.
 
-        An obstacle is in all frames. Before its first place and after its last place it is at rest there.
+        All particles and obstacles count in all frames. An obstacle is at rest before its first and after its last
+        place.
         """
         count = len(self.frames[-1].position_N3)
-        position_TN3 = np.full((len(self.frames), count, 3), np.nan, np.float32)
-        for position_N3, frame in zip(position_TN3, self.frames, strict=True):
+        vertices = {o.body: len(o.body.mesh.vertex_V3) for frame in self.frames for o in frame.obstacles}
+        most = max(2, self.limit_bytes // (SAVED_BYTES * max(1, count + sum(vertices.values()))))
+        frames = [*self.frames][-most:]
+        position_TN3 = np.full((len(frames), count, 3), np.nan, np.float32)
+        for position_N3, frame in zip(position_TN3, frames, strict=True):
             position_N3[: len(frame.position_N3)] = frame.position_N3
-        entry_N = np.searchsorted([len(frame.position_N3) for frame in self.frames], np.arange(count), side="right")
+        entry_N = np.searchsorted([len(frame.position_N3) for frame in frames], np.arange(count), side="right")
         places: dict[int, list[tuple[int, PlacedObstacle]]] = {}
-        for index, frame in enumerate(self.frames):
+        for index, frame in enumerate(frames):
             for obstacle in frame.obstacles:
-                places.setdefault(obstacle.body.number, []).append((index, obstacle))
+                path = places.setdefault(obstacle.body.number, [])
+                if not path or path[-1][1] is not obstacle:
+                    path.append((index, obstacle))
         return Rollout(
             position_TN3=position_TN3,
             material_N=self.material_N[:count],

@@ -401,7 +401,7 @@ class PlaySession:
         return archive.getvalue()
 
     def rollout(self) -> Rollout:
-        """Returns all frames that are kept, as a rollout."""
+        """Returns the newest frames as a rollout, whose file is within the bytes that are kept."""
         rate = self.simulator.frame_rate_hz
         return self.recording.rollout(
             self.domain_size, rate, self.cell_size, {"weights": self.weights, "scene": "play"}
