@@ -55,7 +55,8 @@ def main(mapping: dict[str, Any]) -> int:
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, settings_of_imported(mapping))
-    require_replaceable("run", Path(config.run) / "config.yaml")
+    folder, run = config.dataset.folder, Path(config.run)
+    outlived(lambda: require_replaceable("run", run / "config.yaml"), run / "config.yaml", start=True)
     if not first_on_machine():
         # If the process that started this rank ends, the rank ends immediately instead of after a time-out.
         die_with_parent(signal.SIGKILL)
@@ -67,7 +68,6 @@ def main(mapping: dict[str, Any]) -> int:
             raise ConfigError(
                 f"training.loggers[{i}] must be installed, got {logger}; {missing_extra(error)}"
             ) from None
-    folder, run = config.dataset.folder, Path(config.run)
     manifest = Manifest.load(folder) if config.imported or EpisodeStore.available(folder) else None
     if manifest is not None and config.imported:
         require_network_fits(config, manifest)
@@ -78,9 +78,10 @@ def main(mapping: dict[str, Any]) -> int:
     stop.listen()
     with ExitStack() as stack:
         if first_rank():
-            stack.enter_context(locked(run / ".lock", "run", "another training is in it; wait for its end, or choose"))
+            refusal = "another training is in it; wait for its end, or choose"
+            outlived(lambda: stack.enter_context(locked(run / ".lock", "run", refusal)), run / ".lock", start=True)
         checkpoints = run / "checkpoints"
-        resume = outlived(lambda: _checkpoint_to_resume(config, checkpoints), checkpoints)
+        resume = outlived(lambda: _checkpoint_to_resume(config, checkpoints), checkpoints, start=True)
         initial = _initial_network(config, resume)
         generator = None
         # A URL is a service that generates missing episodes itself.

@@ -19,6 +19,9 @@ from hgn.schema import ConfigError, printable, require
 
 VARIABLE = "HGN_PATIENCE_S"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
+# errors of a file server or of the way to it; others at the start of a training may be mistakes in a name
+OF_SERVERS = {errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.ETIMEDOUT, errno.EREMOTEIO, errno.EHOSTDOWN}
+OF_SERVERS |= {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.ECONNABORTED}
 
 T = TypeVar("T")
 without = threading.Event()  # while this is set, no thread waits to read
@@ -61,16 +64,17 @@ def without_patience() -> contextlib.AbstractContextManager[None]:
     return inside(without)
 
 
-def outlived(write: Callable[[], T], path: Path) -> T:
+def outlived(write: Callable[[], T], path: Path, start: bool = False) -> T:
     """Returns `write()`, and retries it for the standard patience if a file of a run cannot be written or is away.
 
-    Raises UnreachableError with `path`, or AwayError; at once IsADirectoryError and NotADirectoryError.
+    Raises UnreachableError with `path`, or AwayError; at once IsADirectoryError and NotADirectoryError, and at the
+    start of a training all errors but OF_SERVERS.
     """
 
     def cause(error: Exception) -> str | None:
-        lasting = isinstance(error, (IsADirectoryError, NotADirectoryError))
-        passing = isinstance(error, (OSError, AwayError)) and not lasting
-        return str(error) if passing else None
+        lasting = isinstance(error, (IsADirectoryError, NotADirectoryError, UnreachableError))
+        lasting |= start and getattr(error, "errno", errno.EIO) not in OF_SERVERS
+        return str(error) if isinstance(error, (OSError, AwayError)) and not lasting else None
 
     return patiently(write, cause, str(path), str(path.parent), standard_patience_s(), ended=threading.Event())
 

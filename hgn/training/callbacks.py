@@ -97,9 +97,12 @@ class Checkpoints(Callback):
         self.measured_update = int(state_dict.get("measured_update", 0))  # missing in checkpoints of 0.2.0 and before
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if trainer.is_global_zero:
+        def clear() -> None:
             for left_by_a_crash in self.folder.glob(f".*{TEMPORARY_SUFFIX}"):
                 left_by_a_crash.unlink()
+
+        if trainer.is_global_zero:
+            outlived(clear, self.folder, start=True)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._saved_update = _update(pl_module) or -1  # the checkpoint of a resumed run; -1: none

@@ -42,6 +42,11 @@ class CheckpointWriter(TorchCheckpointIO):
         copy, place = snapshot(checkpoint), Path(path)
         self._writing = self._thread.submit(outlived, lambda: _write(copy, place, self._earlier), place)
 
+    def load_checkpoint(self, path: Any, *given: Any, **options: Any) -> Any:
+        return outlived(
+            lambda: super(CheckpointWriter, self).load_checkpoint(path, *given, **options), path, start=True
+        )
+
     def wait(self) -> None:
         """Returns when the last checkpoint is on disk. Raises: OSError if it could not be written."""
         if self._writing is not None:

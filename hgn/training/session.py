@@ -29,6 +29,7 @@ from hgn.schema import from_stored, printable, to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.loading import loading
+from hgn.system.patience import outlived
 from hgn.system.provenance import provenance, with_texts
 from hgn.system.ranks import first_on_machine, first_rank
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo, Resume
@@ -92,7 +93,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     feed = EpisodeDataModule(store, training, reader, interrupted=lambda: stop.requested)
     if resume is not None:
         feed.first_update, feed.sampler_state = resume.progress.updates, resume.progress.sampler_state
-    _write_run_files(config, start.store.manifest)
+    outlived(lambda: _write_run_files(config, store.manifest), run / "config.yaml", start=True)
 
     writer = CheckpointWriter()
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
@@ -240,8 +241,8 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], trained: 
             f"{format_ratio(last.get('baseline_ratio/validation', math.nan))} the best baseline's; few frames contain "
             "most of the error, so hgn.evaluate, which measures all frames, may print another ratio"
         )
-    folder = Path(config.run) / "checkpoints"
-    if not (folder / BEST_NAME).exists():
-        print(f"no {BEST_NAME}, because no validation scene was measured; export {folder / LAST_NAMES[0]}")
+    best = Path(config.run) / "checkpoints" / BEST_NAME
+    if not outlived(best.exists, best):
+        print(f"no {BEST_NAME}, because no validation scene was measured; export {best.with_name(LAST_NAMES[0])}")
     if stopped:
         print("stopped; the same command resumes it")
