@@ -216,7 +216,11 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> Scene:
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.data_materials)
     if not info.network.obstacle_features:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as in conf/scene/no_obstacles.yaml
-    return generate_scene(drawn, config.random_seed)
+    try:
+        return generate_scene(drawn, config.random_seed)
+    except ConfigError as error:
+        name = f"random scene with the weights' obstacle_cell_size of {info.obstacle_cell_size:g}"
+        raise ConfigError(f"{name}: {error}; or give scene=…") from error
 
 
 if __name__ == "__main__":

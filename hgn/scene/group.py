@@ -12,6 +12,7 @@ import numpy as np
 from hgn.schema import Vector
 
 WALL_CELLS = 3  # thickness of the solver's walls (MpmConfig.wall_cells); no particle starts inside them
+MOST_PARTICLES = 10_000_000  # largest number in a scene file or a random scene
 
 
 @dataclass(frozen=True)

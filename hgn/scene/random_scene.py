@@ -12,7 +12,7 @@ import numpy as np
 
 from hgn.config import SceneConfig
 from hgn.scene.funnel import Funnel, draw_funnel
-from hgn.scene.group import WALL_CELLS, Region, points_in_ball, random_direction, region_of
+from hgn.scene.group import MOST_PARTICLES, WALL_CELLS, Region, points_in_ball, random_direction, region_of
 from hgn.scene.own_physics import with_elastic_bodies
 from hgn.scene.placement import (
     CLEARANCE_CELLS,
@@ -59,6 +59,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     Raises: ConfigError if an item does not fit. The message names the setting to change.
     """
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
+    _require_cells(config)
     kind, config = None, with_elastic_bodies(config, seed)
     if config.kinds:
         kind, drawn = draw_layout(config, seed)
@@ -92,6 +93,16 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
         bodies += [_fill_group(config, "cube", region, lone_rng) for region in lone]
         return assemble(config, seed, gravity, obstacles, bodies, kind)
     raise ConfigError(f"{failure} ({LAYOUTS} layouts, seed {seed})")
+
+
+def _require_cells(config: SceneConfig) -> None:
+    """Raises ConfigError for cells so large that walls fill the domain, or with too many particles, at any seed."""
+    largest, size = min(config.domain_size) / (2 * (WALL_CELLS + CLEARANCE_CELLS)), config.cell_size
+    rule, remedy = f"at most {largest:g}, a tenth of the domain's smallest side", "lower it, or raise domain_size"
+    require(size <= largest, "cell_size", rule, size, remedy)
+    least = config.group_size * (config.group_count * config.particles_per_cell / MOST_PARTICLES) ** (1 / 3)
+    rule = f"at least {least:.3g} for at most {MOST_PARTICLES} particles"
+    require(size >= least, "cell_size", rule, size, "raise it, or lower particles_per_cell")
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ def whole_cells(domain_size: Vector, cell_size: float) -> tuple[int, int, int]:
     require(0 < cell_size < math.inf, "cell_size", "a finite number > 0", cell_size)
     counts = [length / cell_size for length in domain_size]
     for axis, length, cells in zip("xyz", domain_size, counts, strict=True):
-        whole = math.isfinite(cells) and abs(cells - round(cells)) <= CELL_TOLERANCE
-        near = round(cells) * cell_size if math.isfinite(cells) else 1.0
+        whole = math.isfinite(cells) and abs(cells - max(1, round(cells))) <= CELL_TOLERANCE
+        near = max(1, round(cells)) * cell_size if math.isfinite(cells) else 1.0
         remedy = f"for example {near:.6g}"
         require(whole, f"domain_size ({axis})", f"a whole number of cells of {cell_size:.6g}", length, remedy)
     require_few_cells(domain_size, cell_size)

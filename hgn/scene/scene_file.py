@@ -19,7 +19,7 @@ import numpy as np
 from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.distance import contains, extent
 from hgn.scene.emission import Face
-from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
+from hgn.scene.group import MOST_PARTICLES, WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
 from hgn.scene.particle_file import read_particles
@@ -44,7 +44,7 @@ from hgn.schema import (
 from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
-MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 10_000_000, 256  # entries are obstacles, or groups and emitters
+MAXIMUM_ENTRIES = 256  # entries are obstacles, or groups and emitters
 # limit of the bytes of files, each counted as often as a scene names it: FILES_BYTES, or REPEATS times the bytes of the
 # files counted once, if that is more
 FILES_BYTES, REPEATS = 12 << 20, 8
@@ -294,7 +294,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
     bodies = [_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles)]
     # sheets of partly watertight meshes come last, so that entry i has obstacle i
     obstacles = (*(first for first, *_ in bodies), *(sheet for _, *others in bodies for sheet in others))
-    rule = f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters"
+    rule = f"at most {MOST_PARTICLES} particles together, with those of emitters"
     total: float = 0
     stored: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for i, entry in enumerate(file.groups):
@@ -302,7 +302,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
             name = f"groups[{i}].particles"
             stored[i] = read_particles(folder / entry.particles, name, entry.material, file.domain_size)
             total += len(stored[i][0])
-            require(total <= MAXIMUM_PARTICLES, "groups", rule, total, "leave some files out")
+            require(total <= MOST_PARTICLES, "groups", rule, total, "leave some files out")
     filling = file.particles_per_cell, file.cell_size
     try:
         counts = [
@@ -313,7 +313,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         total = sum(counts) + sum(entering)
     except ArithmeticError:  # sizes or cells beyond the range of floats
         total = math.inf
-    require(total <= MAXIMUM_PARTICLES, "groups", rule, total, "lower size or particles_per_cell")
+    require(total <= MOST_PARTICLES, "groups", rule, total, "lower size or particles_per_cell")
     positions, times = [], [np.zeros(sum(counts))]
     for index, (entry, count) in enumerate(zip(file.groups, counts, strict=True)):
         if index in stored:

@@ -175,6 +175,7 @@ def spoil(tensors):
 
 
 MESH = of("edit_scene", "shape: cone, size: 0.3", "mesh: points.obj")
+RANDOM = "random scene with the weights' obstacle_cell_size of "
 STEPS = [*EVALUATE, "rollout_frames=0"]
 CUT_RUN, OF_RUN = of("damage_run", truncate), [OF_THE_RUN, EXPORT[1]]
 RATE, SNOW = of("weights", frame_rate_hz=30.0), of("weights", materials=("snow",))
@@ -212,6 +213,15 @@ FILES = [
     ),
     ("evaluate", STEPS, of("weights", gravity=(0.0, -1.6, 0.0)), "gravity must be the weights' (0.0, -1.6, 0.0)"),
     ("evaluate", STEPS, of("weights", obstacle_cell_size=1 / 32), "cell_size must be the weights' 0.03125, the siz"),
+    *(
+        (
+            "rollout",
+            ["weights=weights.safetensors"],
+            of("weights", obstacle_cell_size=size),
+            f"{RANDOM}{size:g}: cell_size must be {rule}",
+        )
+        for size, rule in ((1e9, "at most 0.1"), (0.2, "at most 0.1"), (1e-9, "at least 0.0"), (1e-3, "at least 0.0"))
+    ),
 ]
 
 

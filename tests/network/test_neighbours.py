@@ -6,6 +6,7 @@ from network.naive_gns import naive_edges
 
 from hgn.network.grid import GridRangeError, build_hierarchy
 from hgn.network.neighbours import neighbour_list
+from hgn.schema import ConfigError
 
 RADIUS = 0.1
 
@@ -64,3 +65,25 @@ def test_positions_out_of_range(value):
         neighbour_list(position, scene, RADIUS)
     with pytest.raises(GridRangeError, match="must be finite and within"):
         build_hierarchy(position, scene, torch.zeros(1, 3, dtype=torch.float64), 0.25, 2)
+
+
+@pytest.mark.parametrize(
+    ("count", "spread", "radius"),
+    [(4100, 1.0, 1e9), (4100, 1.0, 1e3), (4100, 0.01, RADIUS), (5000, 0.0, 1e-9), (40_000, 1.0, 0.5), (1100, 1.0, 9.0)],
+)
+def test_too_many_neighbours_are_refused(monkeypatch, count, spread, radius):
+    """Memory and time are proportional to their number. Radius or density can be wrong, also by a unit of length. Of
+    large bodies no pairs are listed."""
+    if count > 4000:
+        monkeypatch.setattr(torch, "repeat_interleave", lambda *_, **__: pytest.fail("listed"))
+    rule = r"network\.cell_size must be below .*, for at most 1000 neighbours on average, got \d+; lower it, or use"
+    with pytest.raises(ConfigError, match=rule):
+        neighbour_list(points(count, spread), torch.zeros(count, dtype=torch.long), radius)
+
+
+def test_dense_bodies_are_not_refused():
+    """A body of this project's data has up to 400 neighbours a particle. All of a small scene may be neighbours."""
+    side = torch.arange(24, dtype=torch.float64) / 128
+    for position, radius in ((torch.cartesian_prod(side, side, side), 0.035), (points(1000, 1.0), 1e9)):
+        found = neighbour_list(position, torch.zeros(len(position), dtype=torch.long), radius)
+        assert len(found.sender_E) >= 250 * len(position)

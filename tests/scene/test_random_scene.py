@@ -279,10 +279,18 @@ def test_wide_and_empty_scenes():
         ({"group_size": 0.4, "group_count": 9}, "group_count must leave room"),
         ({"domain_size": (0.25,) * 3, "group_count": 0, "lone_particles": 40}, "lone_particles must leave"),
         ({"domain_size": (0.6,) * 3, **FUNNELS, "obstacle_size": (0.1, 0.9)}, "funnel_scene_fraction must be 0 if"),
+        *(({"cell_size": size} | more, "cell_size must be at most 0.1, a tenth of the domain's smallest side, got")
+          for size in (0.101, 1.0, 1e9, 1e30)
+          for more in ({}, {"kinds": {"pool": 1.0}, "obstacle_count": 5}, {"group_count": 0})),
+        ({"domain_size": (9.0, 0.5, 9.0), "cell_size": 0.06}, "cell_size must be at most 0.05, a tenth"),
+        *(({"cell_size": size} | more, r"cell_size must be at least 0.0\d+ for at most 10000000 particles, got")
+          for size in (1e-3, 1e-9, 1e-30)
+          for more in ({}, {"kinds": {"edge": 1.0}, "obstacle_count": 5}, {"obstacle_count": 5})),
+        ({"particles_per_cell": 1e6}, r"cell_size must be at least 0.0\d+ for at most 10000000 particles, got"),
         ({"seed": -1}, "seed must be a whole number >= 0"),
         ({"seed": 1.5}, "seed must be a whole number >= 0"),
     ],
-)
+)  # fmt: skip
 def test_what_does_not_fit_is_named(changes, message):
     """Too many or too large items raise an error that names the item and the setting to change. Bad seeds raise one
     too."""
