@@ -39,7 +39,7 @@ _PORT, _WORD = r"\d+(?:[,;)'\"]|\s(?![^\s@:]+@)|$)", rf"(?:(?!://)\S){_MOST}"
 _HOST = r"(?:[^\s/:@]{1,255}:\d{1,5}|\[?[\da-fA-F:.]{2,39}\](?::\d{1,5})?)/"
 _USER = rf"[^\s/:@]{_MOST}:{_WORD}|[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}:(?=\S)(?!{_PORT})(?:(?!://)[^@]){_MOST}"
 _SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt|sas|hmac|bearer|session|ticket)[\w.-]*|key(?:_?id)?|code"
-_SECRET += r"|(?<![a-z])(?:pw|otp|sid)"
+_SECRET += r"|(?<![a-z])(?:pw|otp|sid|hash|st|[kp])"
 
 
 def _without_value(query: re.Match[str]) -> str:
@@ -51,6 +51,7 @@ def _without_value(query: re.Match[str]) -> str:
 # keys outside URLs, with the sign that follows, and their values: a text, a list, or a word after its scheme
 _KEY = r"[\w.-]{0,99}?(?:token|secret|passw(?:or)?d|authorization|api[_-]?key)\w*"
 _VALUE = r"b?(?:'[^']*'?|\"[^\"]*\"?)|[\[({][^\])}\n]*[\])}]?|(?:(?:bearer|basic)\s+)?[^\s'\"]*[^\s'\",;.)\]}]"
+_TOKEN = r"(?:hf|gh[oprsu]|npm)_(?=[^\W_]{16})|(?:AIza|github_pat_|(?:glpat|sk|xox[a-z]|pypi)-)(?=[\w-]*\d)"
 _SECRETS = (  # pattern and replacement: for users of URLs and of addresses without a scheme, and for signatures
     (rf"(\w://)(?!{_HOST})(?:{_USER})?@", r"\1"),
     (
@@ -66,6 +67,7 @@ _SECRETS = (  # pattern and replacement: for users of URLs and of addresses with
     (rf"(?i)(['\"])(\+{{0,2}}(?:[\w.]+=)?{_KEY}[ \t]*[=:][ \t]*)(?!['\"])(?:'\"'\"'|(?!\1).)+", r"\1\2…"),
     (rf"(?i)(?<![\w.?&;#%-])({_KEY}['\"]?[ \t]*[=:][ \t]*)(?:{_VALUE})", r"\1…"),
     (r"(?i)(\bbearer\s+)(?=\S*\d)[^\s'\"]+", r"\1…"),
+    (rf"(?<![\w-])({_TOKEN})[\w-]{{16,}}", r"\1…"),
 )
 _LONG = 20_000  # characters of a message that is shortened before passwords are removed
 # the owner's path, and the value's own name or index; joined for messages
@@ -217,9 +219,7 @@ def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
     """Returns the types of a dataclass's fields, and whether each is required. It is slow, so results are cached."""
     given = {field.name: field for field in dataclasses.fields(cls) if field.init}
     missing = dataclasses.MISSING
-    return typing.get_type_hints(cls), {
-        k: f.default is missing and f.default_factory is missing for k, f in given.items()
-    }
+    return typing.get_type_hints(cls), {k: f.default is f.default_factory is missing for k, f in given.items()}
 
 
 def section_of(cls: type) -> str:

@@ -65,7 +65,7 @@ def sync_staged(path: Path) -> None:
 def require_sealed(path: Path) -> None:
     """Raises ConfigError if a staged file has changed: a disk failed, or the machine lost its power."""
     digest, seal = hashlib.sha256(), len(_seal(hashlib.sha256()))
-    with open_at_once(path) as file:
+    with errors_name(path), open_at_once(path) as file:
         size = max(os.fstat(file.fileno()).st_size - seal, 0)
         for start in range(0, size, _COPY_BYTES):
             digest.update(file.read(min(_COPY_BYTES, size - start)))

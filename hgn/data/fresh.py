@@ -13,8 +13,9 @@ from typing import Any
 from hgn.data.manifest import MANIFEST_NAME
 from hgn.data.storage import is_remote, local_folder
 from hgn.data.verification import file_sha256
-from hgn.schema import ConfigError, from_mapping, require, strict_json, to_mapping
+from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_json
+from hgn.system.yaml_files import read_json
 
 FRESH_NAME = "fresh.json"
 
@@ -61,7 +62,7 @@ def read_fresh(folder: Path | str) -> FreshSeed | None:
     if is_remote(folder) or not path.is_file():
         return None
     try:
-        return from_mapping(FreshSeed, strict_json(path.read_text()), str(path))
+        return from_mapping(FreshSeed, read_json(path), str(path))
     except ValueError as error:
         raise ConfigError(f"{path} must be a file that python -m datagen frozen=… wrote, got {error}") from error
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hgn.scene.episode import Episode, encode_episode
 from hgn.schema import ConfigError
-from hgn.system.files import open_at_once
+from hgn.system.files import errors_name, open_at_once
 
 
 def episode_tar(episode: Episode) -> Iterator[bytes | memoryview]:
@@ -35,7 +35,7 @@ def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     located: dict[str, dict[str, tuple[int, int]]] = {}
     size = path.stat().st_size
     try:
-        with open_at_once(path) as file, tarfile.open(fileobj=file, mode="r:") as tar:
+        with errors_name(path), open_at_once(path) as file, tarfile.open(fileobj=file, mode="r:") as tar:
             for info in tar:
                 if not 0 <= info.size <= size:
                     raise tarfile.ReadError(f"{info.name} of {info.size} bytes")

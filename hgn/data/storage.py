@@ -26,7 +26,7 @@ from hgn.data.shard_cache import Append, CachedShard, cached_shard
 from hgn.data.verification import StorageError, verify_file
 from hgn.schema import ConfigError, near_name, require
 from hgn.system.extras import missing_extra
-from hgn.system.files import open_at_once, read_replaced
+from hgn.system.files import errors_name, open_at_once, read_replaced
 from hgn.system.hub import PREFIX, HubPlace, hub_token, is_loopback, refused_by_proxy
 from hgn.system.patience import UnreachableError, inside, patiently, standard_patience_s
 
@@ -190,7 +190,7 @@ class _Folder(Storage):
         return read_replaced(self._folder / name)
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        with open_at_once(self._folder / name) as file:
+        with errors_name(self._folder / name), open_at_once(self._folder / name) as file:
             if (size := os.fstat(file.fileno()).st_size) < stop:
                 raise _cut(f"{self._folder}/{name}", stop, size)
             file.seek(start)

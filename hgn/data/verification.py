@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 from hgn.schema import ConfigError
-from hgn.system.files import open_at_once
+from hgn.system.files import errors_name, open_at_once
 
 
 class StorageError(ConfigError):
@@ -16,7 +16,7 @@ _verified: set[tuple[str | int, ...]] = set()  # identities of the files that th
 
 def file_sha256(path: Path) -> str:
     """Returns the sha256 of a file in hexadecimal."""
-    with open_at_once(path) as file:
+    with errors_name(path), open_at_once(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -62,7 +62,7 @@ def read_replaced(path: Path) -> bytes:
     """
     for attempt in range(_LOST_AT_MOST + 1):
         try:
-            with open_at_once(path) as file:
+            with errors_name(path), open_at_once(path) as file:
                 return file.read()
         except OSError as error:
             if error.errno != errno.ESTALE or attempt == _LOST_AT_MOST:

@@ -13,6 +13,7 @@ import yaml
 
 from hgn.schema import ConfigError, require, strict_json
 from hgn.system.claims import count_items
+from hgn.system.files import errors_name
 
 MAXIMUM_BYTES = 250_000  # largest size of a YAML file: PyYAML takes a CPU second for 50 kB
 MAXIMUM_NODES = 100_000  # values of a file, aliases resolved
@@ -33,7 +34,9 @@ def read_yaml(path: Path) -> Any:
     rule, size = f"a YAML file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
     require(size <= MAXIMUM_BYTES, str(path), rule, size, "particles belong in .npz files")
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        with errors_name(path):
+            text = path.read_text(encoding="utf-8")
+        return yaml.load(text, _Loader)
     except UnicodeDecodeError as error:
         zipped = error.object.startswith(b"PK\x03\x04")
         reason = "a zip file; unpack it, and give the YAML file in it" if zipped else "not UTF-8 text"
@@ -48,7 +51,8 @@ def read_yaml(path: Path) -> Any:
 
 def read_json(path: Path) -> Any:
     """Returns the content of a JSON file. Raises ValueError for another file, or for a repeated key."""
-    return strict_json(path.read_text("utf-8"))
+    with errors_name(path):
+        return strict_json(path.read_text("utf-8"))
 
 
 class _Loader(yaml.SafeLoader):

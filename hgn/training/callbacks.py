@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from hgn.data.storage import StorageError
 from hgn.schema import ConfigError, to_mapping
-from hgn.system.files import TEMPORARY_SUFFIX, open_at_once, write_atomically
+from hgn.system.files import TEMPORARY_SUFFIX, errors_name, open_at_once, write_atomically
 from hgn.system.locks import make_again
 from hgn.system.patience import outlived
 from hgn.system.progress import bar, duration
@@ -292,7 +292,7 @@ def log(trainer: Trainer, run: Path, update: int, values: dict[str, float]) -> N
 
 def _drop_cut_line(path: Path) -> None:
     """Removes an incomplete last record, left by a full disk or a loss of power."""
-    with contextlib.suppress(FileNotFoundError), open_at_once(path) as file:
+    with errors_name(path), contextlib.suppress(FileNotFoundError), open_at_once(path) as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
         if file.read() not in (b"", b"\n"):
             file.seek(0)

@@ -238,6 +238,19 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
             "h?pw=s&ticket=s&otp=s&sid=s&a[token]=s&b%5Bkey%5D=s&n[]=1",
             "h?pw=…&ticket=…&otp=…&sid=…&a[token]=…&b%5Bkey%5D=…&n[]=1",
         ),
+        ("h?hash=s&st=s&k=s&p=s&P=s 'h?K=s;%68ash=s&x_k=s'", "h?hash=…&st=…&k=…&p=…&P=… 'h?K=…;%68ash=…&x_k=…'"),
+        ("h?top=1&test=2&mask=3&st_n=4&step=5&clip=6", "h?top=1&test=2&mask=3&st_n=4&step=5&clip=6"),
+        *(
+            (
+                f"got {begin}{20 * 'aB3'}, 'x/{begin}{20 * 'c4'}'; {begin}short",
+                f"got {begin}…, 'x/{begin}…'; {begin}short",
+            )
+            for begin in ("hf_", "ghp_", "gho_", "github_pat_", "glpat-", "sk-", "xoxb-", "AIza", "npm_", "pypi-")
+        ),
+        (
+            plain := "mask-abcdefghijklmnopqrstuvwx, half_abcdefghijklmnopqrstuvwx9, disk-2026-11-30-a-b-c-d-e-f-g",
+            plain,
+        ),
         ("h?inside=1&resid=2&a[n]=3", "h?inside=1&resid=2&a[n]=3"),
         ("got u@d.com:secret@h/a, 'u@d.com:secret@h/a'", "got h/a, 'h/a'"),
         ("got u@127.0.0.1:80/a@b", "got u@127.0.0.1:80/a@b"),
