@@ -7,6 +7,7 @@ opens its websocket below its own path. A cookie would be sent to the servers of
 
 import asyncio
 import contextlib
+import functools
 import hmac
 import http
 import io
@@ -16,6 +17,7 @@ import secrets
 import socket
 import sys
 import traceback
+import typing
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable
@@ -24,6 +26,7 @@ from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
+import msgspec
 import viser
 import websockets.asyncio.server
 from viser import _gui_api, infra
@@ -47,6 +50,7 @@ SENT = (
     *(messages.SceneNodeClickMessage, messages.SceneNodeDragMessage, messages.ScenePointerMessage),
     *(messages.FileTransferStartUpload, messages.FileTransferPart, messages.ViewerCameraMessage),
 )  # messages that viewers may send, in addition to values of controls
+_kinds: Callable[[Any], dict[str, Any]] = functools.cache(typing.get_type_hints)
 Process = Callable[[Any, Request], Response | None]
 _LOG = logging.getLogger(__name__)
 # websockets logs it with a traceback for each connection that a browser opens and never uses
@@ -141,7 +145,7 @@ def is_sent(message: Any, controls: dict[str, Any]) -> bool:
     Viser converts values to any type, and stores an uploaded file as the value of any control that is named with it.
     """
     updates, fields = isinstance(message, messages.GuiUpdateMessage), vars(message)
-    if not (updates or (isinstance(message, SENT) and all(map(is_short, fields.values())))):
+    if not (updates or (isinstance(message, SENT) and all(map(is_short, fields.values())) and is_typed(message))):
         return False
     name = fields.get("uuid", fields.get("source_component_uuid"))
     control = controls.get(name) if isinstance(name, str) else None
@@ -158,14 +162,25 @@ def is_sent(message: Any, controls: dict[str, Any]) -> bool:
     return upload and isinstance(fields.get("content", b""), bytes)
 
 
+def is_typed(message: Any) -> bool:
+    """Returns whether fields have the types that Viser declares. It ends the connection of a camera with others."""
+    if isinstance(message, messages.ViewerCameraMessage):
+        return True
+    kinds = _kinds(type(message))
+    try:
+        for name, value in vars(message).items():
+            msgspec.convert(value, kinds[name])
+    except (msgspec.ValidationError, KeyError):
+        return False
+    return True
+
+
 def is_short(value: Any) -> bool:
     """Returns whether a field of a message is bounded and finite. The size of bytes is bounded by `bounded`."""
     if isinstance(value, tuple):
         return len(value) <= 4 and all(map(is_short, value))
-    if isinstance(value, int):  # larger integers cannot be sent to the other viewers
+    if isinstance(value, (int, float)):  # larger integers cannot be sent to the other viewers; False for NaN
         return abs(value) <= LARGEST_NUMBER
-    if isinstance(value, float):
-        return math.isfinite(value)
     return value is None or isinstance(value, bytes) or (isinstance(value, str) and len(value) <= LONGEST_TEXT)
 
 

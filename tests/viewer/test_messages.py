@@ -55,6 +55,14 @@ def pointed(**other):
     return lambda page: viser_compat.messages.ScenePointerMessage(**values)
 
 
+def dragged(**other):
+    """A motion of the mouse with a button pressed."""
+    values = {"phase": "update", "name": "/room", "instance_index": None, "button": "left", "modifier": "shift"}
+    values |= {f"{at}_position": (0.5, 0.5, 0.5) for at in ("start", "end")}
+    values |= {f"{at}_screen_pos": (0.5, 1) for at in ("start", "end")}
+    return lambda page: viser_compat.messages.SceneNodeDragMessage(**values | other)
+
+
 def received(page, client, messages):
     """Gives messages to the server, as a viewer's connection would."""
 
@@ -104,6 +112,15 @@ def parts(page, name, count, size):
         *((pointed(**{name: None}), False) for name in ("ray_origin", "ray_direction")),
         *((pointed(**other), False) for other in ({"event_type": "rect-select"}, {"screen_pos": ()})),
         *((pointed(ray_origin=value), False) for value in ((0.0, NAN, 0.0), [0.0, 1.0], (0.0, 0.0, -INFINITE))),
+        *(
+            (pointed(ray_origin=value), False)
+            for value in (3 * (None,), (0.0, 0.0), (1e308, 0.0, 0.0), (True, 0.0, 0.0))
+        ),
+        *((upload("Own mesh", filename=value), False) for value in (None, b"a.obj", 5, ("a.obj",))),
+        *((upload("Own mesh", part_count=value), False) for value in (0.5, None, "x")),
+        (dragged(), True),
+        *((dragged(end_screen_pos=value), False) for value in ((1e308, 0), (None, 0), (), ("a", "b"))),
+        *((dragged(**other), False) for other in ({"phase": "x"}, {"name": 5}, {"end_position": (0.5, 0.5)})),
         (lambda page: viser_compat.messages.ShareUrlRequest(), False),
         (lambda page: viser_compat.messages.ResetGuiMessage(), False),
     ],
@@ -112,8 +129,10 @@ def test_messages_that_are_not_of_the_page(page, monkeypatch, message, passes):
     """A viewer can set only values of controls, of their types. Only the upload button accepts files, with bounded
     texts and with numbers that can be sent to other viewers. The server requests no address."""
     asked, handled = [], page.server._websock_server._incoming_handlers
-    for kind in (viser_compat.messages.ShareUrlRequest, viser_compat.messages.ScenePointerMessage):
-        monkeypatch.setitem(handled, kind, [lambda client, message: asked.append(message)])
+    for kind in ("ShareUrlRequest", "ScenePointerMessage", "SceneNodeDragMessage"):
+        monkeypatch.setitem(
+            handled, getattr(viser_compat.messages, kind), [lambda client, message: asked.append(message)]
+        )
     sent, uploads = message(page), page.server.gui._current_file_upload_states
     before = {name: dict(vars(state)) for name, state in controls(page).items()} | {"uploads": {*uploads}}
     received(page, 0, [sent])
