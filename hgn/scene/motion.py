@@ -98,10 +98,10 @@ class Motion:
         """Returns the largest mean speed of points of the obstacle between two keyframes, domain units per second."""
         turn_T33, way_T3 = np.diff(self.rotation_T33, axis=0), np.diff(self.translation_T3, axis=0)
         interval_T, fastest = np.diff(self.time_T)[:, None], 0.0
-        step = 1 + SOME_POINTS // len(point_P3)  # motions at once, because all motions of all points could fill memory
+        step = 1 + SOME_POINTS // max(1, len(point_P3))  # all motions of all points could fill memory
         for part in (slice(begin, begin + step) for begin in range(0, len(way_T3), step)):
             way_TP3 = (point_P3 - self.pivot) @ turn_T33[part].transpose(0, 2, 1) + way_T3[part, None]
-            fastest = max(fastest, float((np.linalg.norm(way_TP3, axis=2) / interval_T[part]).max()))
+            fastest = max(fastest, float((np.linalg.norm(way_TP3, axis=2) / interval_T[part]).max(initial=0)))
         return fastest
 
 

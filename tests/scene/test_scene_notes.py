@@ -83,6 +83,7 @@ def test_the_fastest_of_many_points_in_many_turns():
     place_TP3 = np.stack([motion.place(point_P3[:100], time) for time in motion.time_T])
     speed_TP = np.linalg.norm(np.diff(place_TP3, axis=0), axis=2) / np.diff(motion.time_T)[:, None]
     assert motion.fastest(point_P3[:100]) == pytest.approx(speed_TP.max())
+    assert motion.fastest(point_P3[:0]) == 0  # an obstacle without vertices
     tracemalloc.start()
     try:
         motion.fastest(point_P3)
