@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_884,
+    "hgn": 34_892,
     "datagen": 8_932,
     "tools": 6_296,
-    "tests": 36_679,
+    "tests": 36_692,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -8,6 +8,7 @@ effectiveness of quasirandom sequences"), which covers this cube evenly. Frame k
     -R frac(k / g^a)    on axis a = 1, 2, 3,    with g^4 = g + 1
 
 Integer arithmetic gives the fraction, so that all backends have the same origins bitwise. The origin of frame 0 is 0.
+Networks with the rest constraint have the origin 0 in all frames (`HierarchicalGraphNetwork.origin_range`).
 """
 
 import torch
@@ -17,8 +18,8 @@ STEPS = tuple(int(2**32 / ROOT**axis) for axis in (1, 2, 3))  # change of the fr
 FRACTION_BITS = 24  # float32 represents fractions of this many bits exactly
 
 
-def frame_origin(frame_S: torch.Tensor, cell_size: float, dimensions: int) -> torch.Tensor:
-    """Returns the grid origins of scenes at these frames, float32 [S, 3] in (-cell_size, 0]; 0 on unused axes."""
+def frame_origin(frame_S: torch.Tensor, origin_range: float, dimensions: int) -> torch.Tensor:
+    """Returns the grid origins of scenes at these frames, float32 [S, 3] in (-origin_range, 0]; 0 on unused axes."""
     step_3 = torch.tensor([step if axis < dimensions else 0 for axis, step in enumerate(STEPS)], device=frame_S.device)
     fraction_S3 = (frame_S[:, None] * step_3 & 2**32 - 1) >> 32 - FRACTION_BITS
-    return fraction_S3.float() * (-cell_size / 2**FRACTION_BITS)
+    return fraction_S3.float() * (-origin_range / 2**FRACTION_BITS)

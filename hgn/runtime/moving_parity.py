@@ -52,7 +52,7 @@ def require_moving_parity(
     barriers = SceneTable.of_barriers(None, len(domain_S3), device)
     free_P3 = state.position_N3 + state.velocity_NM3[:, 0]
     grid.status.zero_()
-    DeviceStep(step, grid, barriers).integrate(
+    DeviceStep(step, grid, barriers, 0.0).integrate(
         still_P3.new_zeros(len(still_P3), OUT), particles, (domain_S3.new_zeros(3), domain_S3.new_ones(3)),
         lost=lost, frame=frame, path_TN3=torch.zeros_like(still_P3)[None], moving=table,
     )  # fmt: skip

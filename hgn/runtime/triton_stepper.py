@@ -113,7 +113,7 @@ class TritonStepper:
         Buffers have at least `capacity` rows. `obstacles` and `barriers` replace the state's, and `step` the network's.
         """
         self.config, self.device = network.config, state.position_N3.device
-        self.step_config = network.step if step is None else step
+        self.step_config, self.origin_range = network.step if step is None else step, network.origin_range
         self.precision = kernel_precision(precision, self.device)
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
@@ -218,7 +218,7 @@ class TritonStepper:
         buffers.domain_S3.copy_(state.domain_S3)
         buffers.frame_S.copy_(state.frame_S)
         # those of later frames are written by the last kernel of a frame
-        buffers.origin_S3.copy_(frame_origin(state.frame_S, self.config.cell_size, self.config.dimensions))
+        buffers.origin_S3.copy_(frame_origin(state.frame_S, self.origin_range, self.config.dimensions))
         if self.config.relative:
             buffers.gravity_S3.copy_(state.gravity_S3)
         if buffers.wall_friction_S3 is not None:
@@ -287,7 +287,7 @@ class TritonStepper:
         self.grid = DeviceGrid(
             config, window, rounded, scenes=self.scenes, particles=self.particles, device=self.device, more=more
         )
-        self.step = DeviceStep(self.step_config, self.grid, self.barriers)
+        self.step = DeviceStep(self.step_config, self.grid, self.barriers, self.origin_range)
         tuning = replace(Tuning.of(self.precision), half_sums=self.half_sums)
         count, precision = self.buffers.count, self.precision
         self.fused = FusedNetwork(

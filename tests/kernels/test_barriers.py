@@ -51,7 +51,7 @@ def integrated(state, way_N3, step, table):
         torch.zeros_like(state.domain_S3), state.domain_S3, state.gravity_S3, count * one, state.frame_S,
     )  # fmt: skip
     path_TN3 = way_N3.new_zeros(1, count, 3)
-    DeviceStep(step, grid, table).integrate(
+    DeviceStep(step, grid, table, 0.0).integrate(
         output, particles, (zero_3, zero_3 + 1), lost=0 * one, frame=0 * one, path_TN3=path_TN3
     )
     torch.testing.assert_close(path_TN3[0], particles.position_N3, rtol=0, atol=0, equal_nan=True)

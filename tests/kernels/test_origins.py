@@ -47,7 +47,7 @@ def expected_path(network, state, frames, moving=True):
     """Positions [T, N, 3] of the next frames of the plain loop, with the origins of its frames or with origin 0."""
     path = []
     for _ in range(frames):
-        origin_S3 = frame_origin(state.frame_S, network.config.cell_size, network.config.dimensions)
+        origin_S3 = frame_origin(state.frame_S, network.origin_range, network.config.dimensions)
         acceleration_N3 = accelerations(network, state, network.prediction(state, moving * origin_S3))
         state = advanced(state, acceleration_N3.detach(), network.step, network.config.dimensions)
         path.append(state.position_N3)
@@ -82,7 +82,7 @@ def test_the_kernel_has_the_bits_of_the_reference(cell_size, dimensions):
         numbers = [torch.full((1,), x, dtype=torch.int32, device=device()) for x in (status, 0, 5)]
         found_S, origin_S3 = frame_S.clone(), torch.zeros(len(frame_S), 3, device=device())
         advance[(1,)](
-            *numbers, frame_of=found_S, origin=origin_S3, scenes=len(frame_S), cell_size=cell_size,
+            *numbers, frame_of=found_S, origin=origin_S3, scenes=len(frame_S), origin_range=cell_size,
             DIMENSIONS=dimensions, OVERLAP=False, num_warps=1,
         )  # fmt: skip
         assert torch.equal(found_S, frame_S + (status == 0)) and int(numbers[2]) == 5 + (status == 0)
@@ -111,6 +111,19 @@ def test_each_scene_has_the_origins_of_its_frames(backend):
         assert torch.equal(last.frame_S, first_S + 3)
         np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=2e-6)
         assert np.abs(path_TN3 - still_TN3).max() > 1e-4
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_rest_constraint_keeps_the_origin(backend):
+    """Networks with the rest constraint have the origin 0 in all frames."""
+    simulator = simulator_of(backend, rest_threshold=0.1)
+    state = replace(simulator.start([scene(4)]), frame_S=torch.tensor([7], device=device()))
+    still_TN3, moving_TN3 = (expected_path(simulator.network, state, 2, moving) for moving in (False, True))
+    assert np.array_equal(still_TN3, moving_TN3)
+    with simulator.simulation(state) as simulation:
+        np.testing.assert_allclose(simulation.run(2), still_TN3, rtol=0, atol=2e-6)
+        if backend == "triton":
+            assert not simulation.stepper.buffers.origin_S3.any()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -161,7 +174,7 @@ def test_growing_buffers_repeat_no_origin(monkeypatch):
 def test_one_step_on_data_has_the_origin_0():
     """A state that no simulation computed is at frame 0, whose origin is 0: errors of one step do not depend on it."""
     simulator = simulator_of("torch")
-    state = simulator.start([scene(4), scene(3)])
-    outputs = [simulator.network.prediction(state, origin).acceleration_N3 for origin in (None, torch.zeros(2, 3))]
-    assert state.frame_S.tolist() == [0, 0] and torch.equal(*(output.to(device()) for output in outputs))
+    state, zero_S3 = simulator.start([scene(4), scene(3)]), torch.zeros(2, 3, device=device())
+    outputs = [simulator.network.prediction(state, origin).acceleration_N3 for origin in (None, zero_S3)]
+    assert state.frame_S.tolist() == [0, 0] and torch.equal(*outputs)
     assert simulator.step(simulator.step(state)).frame_S.tolist() == [2, 2]

@@ -20,7 +20,7 @@ def rested_on_device(network, state, origin_S3):
     particles = prepare(engine, network, state, origin_S3)
     engine.forward()
     free_N3 = engine.output[: len(state.position_N3), :3].double().cpu()
-    step = DeviceStep(network.step, engine.grid, None)
+    step = DeviceStep(network.step, engine.grid, None, 0.0)
     step.rest(engine.output, particles, network.normaliser.acceleration_std.float().to(engine.device))
     return free_N3, engine.output[: len(state.position_N3), :3].double().cpu()
 

@@ -296,7 +296,7 @@ def integrate(
 
 @triton.jit
 def advance(
-    status, lost, frame, frame_of, origin, scenes, cell_size, DIMENSIONS: tl.constexpr, OVERLAP: tl.constexpr
+    status, lost, frame, frame_of, origin, scenes, origin_range, DIMENSIONS: tl.constexpr, OVERLAP: tl.constexpr
 ):  # fmt: skip
     """Increments the frame if it was integrated, and sets the status to DIVERGED if coordinates were lost.
 
@@ -316,7 +316,7 @@ def advance(
             for axis in tl.static_range(DIMENSIONS):
                 step = (X_STEP, Y_STEP, Z_STEP)[axis]
                 fraction = ((number * step & 0xFFFFFFFF) >> DROPPED_BITS).to(tl.float32) * FRACTION_UNIT
-                tl.store(origin + scene * 3 + axis, fraction * -cell_size, mask=there)
+                tl.store(origin + scene * 3 + axis, fraction * -origin_range, mask=there)
         if tl.load(lost) > 0:
             tl.store(status, DIVERGED)
 

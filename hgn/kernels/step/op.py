@@ -60,8 +60,9 @@ def rest_numbers(step: StepConfig, window: Window, scenes: int, levels: int) -> 
 class DeviceStep:
     """Launches the part of a frame that follows the network's output."""
 
-    def __init__(self, step: StepConfig, grid: DeviceGrid, barriers: SceneTable | None) -> None:
-        """Takes `barriers` if `step.obstacle_clearance` is set."""
+    def __init__(self, step: StepConfig, grid: DeviceGrid, barriers: SceneTable | None, origin_range: float) -> None:
+        """Takes `barriers` if `step.obstacle_clearance` is set. `origin_range` is that of the network."""
+        self.origin_range = origin_range
         self.step, self.config, self.grid, self.barriers = step, grid.config, grid, barriers
         each = len(REST_SUMS)
         parts = [grid.more_cleared[each * level :][:each] for level in range(REST_SIZES * step.rests)]
@@ -125,6 +126,6 @@ class DeviceStep:
         )  # fmt: skip
         kernel.advance[(1,)](
             status=status, lost=lost, frame=frame, frame_of=particles.frame_S, origin=particles.origin_S3,
-            scenes=len(particles.frame_S), cell_size=config.cell_size, DIMENSIONS=config.dimensions, OVERLAP=overlap,
-            num_warps=1, launch_pdl=overlap,
+            scenes=len(particles.frame_S), origin_range=self.origin_range, DIMENSIONS=config.dimensions,
+            OVERLAP=overlap, num_warps=1, launch_pdl=overlap,
         )  # fmt: skip
