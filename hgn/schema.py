@@ -445,6 +445,6 @@ def _name(hint: Any) -> str:
 
 
 def _unquoted(hint: Any, value: Any) -> str:
-    """Returns the remedy for a number in quotes, or an empty text."""
-    quoted = hint is not bool and isinstance(value, str) and re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?", value)
-    return "; write it without quotes" if quoted else ""
+    """Returns the remedy for a number in quotes or with a decimal comma, or an empty text."""
+    number = re.fullmatch(r"[-+]?[\d.]*(,?)[\d.]+([eE][-+]?\d+)?", value if isinstance(value, str) else "")
+    return f"; write it with{' a decimal point' if number[1] else 'out quotes'}" if number and hint is not bool else ""

@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_892,
     "datagen": 8_932,
     "tools": 6_296,
-    "tests": 36_692,
+    "tests": 36_693,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -332,6 +332,7 @@ MISTAKES = [
     (obstacle_with(**MESH), OBSTACLE + r"\.mesh must be an existing file"),
     (group_with(size="wide"), "size must be a number or a list of 3 values or null, got 'wide'$"),
     *((group_with(size=size), r"0\]\.size\S* must .*; write it without quotes$") for size in ("0.1", [".1", 0.1, 0.1])),
+    *((group_with(size=a), "size.* write it with a decimal point$") for a in ("0,1", ",5", "-1,5e-3", ["0,1", 1, 1])),
     (group_with(position=["+5", 0, 0]), r"n\[0\] must be a number, got '\+5' \(str\); write it without quotes$"),
     (scene_with(seed="-5"), r"seed must be a whole number, got '-5' \(str\); write it without quotes$"),
 ]
