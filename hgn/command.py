@@ -1,7 +1,7 @@
 """Runs all commands: Hydra composes the config, and errors that a user can fix end in one line.
 
 Exit codes: 0 success, 1 machine error (full disk, no permission), 2 invalid input (also a file, pipe or device in
-place of a folder, or the reverse), 130 Ctrl-C, 143 SIGTERM, 141 closed output pipe (as in `… | head`).
+place of a folder, or the reverse), 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP, 141 closed output pipe (as in `… | head`).
 """
 
 import atexit
@@ -13,11 +13,13 @@ import itertools
 import os
 import re
 import select
+import signal
 import stat
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn, cast
 
 from hgn.config import config_directory
@@ -73,7 +75,8 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     code: int | str | None
     try:
         try:
-            code = _exit_code(main, config_name)
+            with _ended_as_by_ctrl_c():
+                code = _exit_code(main, config_name)
         except SystemExit as end:  # Hydra ends the process after --help
             code = end.code
         sys.stdout.flush()
@@ -86,6 +89,23 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
     sys.exit(code)
+
+
+@contextmanager
+def _ended_as_by_ctrl_c() -> Iterator[None]:
+    """Lets SIGTERM and SIGHUP raise KeyboardInterrupt with their number. Ignored ones (nohup) stay ignored."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt(number)
+
+    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if signal.getsignal(number) is interrupt:  # a training's own handlers stay until the process ends
+                signal.signal(number, handler)
 
 
 class _Messages(io.FileIO):

@@ -18,7 +18,6 @@ from hgn.schema import FileName, Port, Positive, from_mapping, require, require_
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
 from hgn.system.loading import loading
-from hgn.system.processes import ended_as_by_ctrl_c
 
 if TYPE_CHECKING:
     from hgn.runtime.simulator import Simulator
@@ -52,11 +51,10 @@ def main(mapping: dict[str, Any]) -> int:
         return _write_page(config)
     page = film_page(config) if config.rollout is not None else play_page(config)
     try:
-        with ended_as_by_ctrl_c():
-            print(page.address, flush=True)
-            if config.browser:
-                webbrowser.open(page.address)
-            page.run()
+        print(page.address, flush=True)
+        if config.browser:
+            webbrowser.open(page.address)
+        page.run()
     except KeyboardInterrupt as interruption:
         if interruption.args:  # another signal; Ctrl-C is the normal end
             raise

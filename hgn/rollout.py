@@ -38,7 +38,6 @@ from hgn.schema import (
 )
 from hgn.system.files import require_place
 from hgn.system.loading import loading
-from hgn.system.processes import ended_as_by_ctrl_c
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
@@ -96,8 +95,7 @@ def main(mapping: dict[str, Any]) -> int:
     out = _out(config)
     still, moving = pictures = out.with_suffix(".png"), out.with_suffix(".gif")
     require_replaceable("out", out, *(pictures if drawn else ()))
-    with ended_as_by_ctrl_c():
-        path, result = rollout(config)
+    path, result = rollout(config)
     last = result.frame_count - 1
     present_N3 = result.position_TN3[last, : result.present(last)]
     inside = fraction_inside(present_N3, result.obstacles, last / result.frame_rate_hz)

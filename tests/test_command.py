@@ -3,6 +3,7 @@
 import errno
 import io
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from hgn.command import EXIT_UNREAD, _compose, run_command
 from hgn.schema import ConfigError
-from hgn.system.files import make_folder, write_json
+from hgn.system.files import make_folder, temporary_file, write_json
 
 HEAD = "# @package _global_\n"
 
@@ -134,6 +135,23 @@ def test_full_disk_of_the_output(streams, main, code):
     assert done.returncode == code and not done.stdout
     if "stderr" not in streams:
         assert done.stderr.lower().startswith("error: no space left on") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals(tmp_path, command, number):
+    """Each command ends on a signal as on Ctrl-C: with a line and its exit code, and without temporary files."""
+
+    def interrupted(_):
+        with temporary_file(tmp_path / "a") as temporary:
+            temporary.touch()
+            if number == signal.SIGINT:  # which shells ignore in the background
+                raise KeyboardInterrupt
+            signal.raise_signal(number)
+
+    before = signal.getsignal(number)
+    code, _, error = command("bench", main=interrupted)
+    assert (code, error) == (128 + number, "error: interrupted\n") and not list(tmp_path.iterdir())
+    assert signal.getsignal(number) is before
 
 
 @pytest.mark.parametrize("place", ["pipe", "pipe/a/b", "/dev/null", "/dev/null/a", "link"])

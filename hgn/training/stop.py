@@ -25,9 +25,14 @@ class StopRequest:
         self._deadline: float | None = None
 
     def listen(self) -> None:
-        """Installs handlers for SIGINT, SIGTERM and SIGUSR1. Only the main thread may call this."""
+        """Installs handlers for SIGINT, SIGTERM and SIGUSR1. Only the main thread may call this.
+
+        SIGHUP, unless it is ignored, ends the process, because Python's handlers do not run in a wait for other ranks.
+        """
         for number in BY_WEIGHT:
             signal.signal(number, self._on_signal)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
     def end_at_once(self) -> None:
         """Lets a signal end the process until the next `listen`. While ranks wait for each other in C++, Python's
