@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_892,
+    "hgn": 34_896,
     "datagen": 8_932,
     "tools": 6_296,
-    "tests": 36_693,
+    "tests": 36_711,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 
