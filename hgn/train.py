@@ -74,8 +74,6 @@ def main(mapping: dict[str, Any]) -> int:
     elif manifest is not None:
         require_same_dataset(manifest.config, config.datagen, folder, "dataset.folder=...")
     others = more_data(config)
-    stop = StopRequest()
-    stop.listen()
     with ExitStack() as stack:
         if first_rank():
             refusal = "another training is in it; wait for its end, or choose"
@@ -83,6 +81,8 @@ def main(mapping: dict[str, Any]) -> int:
         checkpoints = run / "checkpoints"
         resume = outlived(lambda: _checkpoint_to_resume(config, checkpoints), checkpoints, start=True)
         initial = _initial_network(config, resume)
+        stop = StopRequest()
+        stop.listen()  # a signal before ends the process at once, also while it waits for its checkpoints
         generator = None
         # A URL is a service that generates missing episodes itself.
         if first_rank() and config.training.generate and not is_remote(folder) and missing_scenes(config, manifest):
