@@ -1,23 +1,26 @@
 """python -m datagen.solve scene=my_scene.yaml out=truth.vtkhdf: simulates a scene file with the solver.
 
 The result for your own scene is like the data from which networks learn. `python -m tools.render rollout=truth.vtkhdf
-others=[rollout.vtkhdf]` draws it next to a network's rollout of the same scene, with the distance between them.
+others=[rollout.vtkhdf]` draws it next to a network's rollout of the same scene, with their errors.
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hgn.command import require_rollout_name, run_command
 from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
-from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
+from hgn.scene.rollout_file import Rollout, write_frames
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError, FrameCount, FrameRate, from_mapping, require_bounds, require_replaceable, to_mapping
-from hgn.system.files import require_place, space_reserved
+from hgn.system.files import require_place
 from hgn.system.progress import advance_to, bar
 
 
@@ -39,7 +42,7 @@ class SolveConfig:
 def main(mapping: dict[str, Any]) -> int:
     """Simulates the scene and writes the file. Returns the exit code.
 
-    Raises: ConfigError for bad input, and for a scene that the solver cannot simulate. Then no file is written.
+    Raises: ConfigError for bad input, and as `solved` does.
     """
     config = from_mapping(SolveConfig, mapping)
     file = find_scene(config.scene)
@@ -49,30 +52,45 @@ def main(mapping: dict[str, Any]) -> int:
     scene = load_scene(file)
     for note in notes_on_files(scene, (config.frames - 1) / config.frame_rate_hz):
         print(note, file=sys.stderr)
-    with space_reserved(out, rollout_bytes(config.frames, scene.particle_count)):
-        rollout = solved(scene, config, file)
-    write_rollout(out, rollout)
+    solved(scene, config, file, out)
     print(out)
     return 0
 
 
-def solved(scene: Scene, config: SolveConfig, file: Path) -> Rollout:
-    """Simulates the scene of a file. Raises: ConfigError for a scene that the solver cannot simulate."""
+def solved(scene: Scene, config: SolveConfig, file: Path, out: Path | None = None) -> Rollout:
+    """Simulates the scene of a file, and writes its frames to `out` as they come.
+
+    Raises: ConfigError for a scene that the solver cannot simulate. `out` then contains the frames so far, if any.
+    """
     # Taichi takes seconds to import, so bad input is reported before.
     from datagen.mpm.solver import SceneFailure, simulate
 
     rate_hz = config.frame_rate_hz
-    with bar("simulating", total=config.frames, initial=1, unit="frame") as progress:
-        shown = lambda frame: advance_to(progress, frame + 1)  # noqa: E731
-        (result,) = simulate([scene], config.mpm, config.frames, rate_hz, on_frame=shown)
-    if isinstance(result, SceneFailure):
-        raise ConfigError(f"{file} must be a scene that the solver can simulate, got {result.cause}")
-    return Rollout(
-        result.position_TN3, scene.material_N, scene.obstacles, scene.domain_size, rate_hz,
+    path_TN3 = np.full((config.frames, scene.particle_count, 3), np.nan, np.float32)
+    rollout = Rollout(
+        path_TN3, scene.material_N, scene.obstacles, scene.domain_size, rate_hz,
         gravity=scene.gravity, cell_size=scene.cell_size,
         source={"scene": config.scene, "solver": to_mapping(config.mpm)},
         entry_frame_N=entry_frames(scene, rate_hz) if scene.emits else None,
     )  # fmt: skip
+    print(f"{scene.particle_count:,} particles, {config.frames:,} frames", file=sys.stderr)
+
+    def run(take: Callable[[np.ndarray], None]) -> None:
+        with bar("simulating", total=config.frames, initial=1, unit="frame") as progress:
+
+            def completed(frame: int) -> None:
+                take(path_TN3[frame, : rollout.present(frame)])
+                advance_to(progress, frame + 1)
+
+            (result,) = simulate([scene], config.mpm, config.frames, rate_hz, completed, trajectories=[path_TN3])
+        if isinstance(result, SceneFailure):
+            raise ConfigError(f"{file} must be a scene that the solver can simulate, got {result.cause}")
+
+    if out is None:
+        run(lambda _: None)
+    else:
+        write_frames(out, rollout, run)
+    return rollout
 
 
 if __name__ == "__main__":

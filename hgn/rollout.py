@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,19 +177,18 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         materials=initial.materials,
         dimensions=initial.dimensions,
     )
-    with closing(_shown(simulated, frames, weights)) as shown:
-        written = save_frames(out, result, shown, config.surface)
-    return written, result
+    print(f"{result.particle_count:,} particles, {frames:,} frames", file=sys.stderr)
+    return save_frames(out, result, partial(_simulate, simulated, frames, weights), config.surface), result
 
 
-def _shown(simulated: Iterator[np.ndarray], count: int, weights: Path) -> Generator[np.ndarray]:
-    """Yields the frames, and shows a progress bar. Raises ConfigError with `weights` if the simulation diverges."""
+def _simulate(frames: Iterator[np.ndarray], count: int, weights: Path, take: Callable[[np.ndarray], None]) -> None:
+    """Gives the frames to `take`, and shows a progress bar. Raises ConfigError with `weights` after a divergence."""
     from hgn.runtime.divergence import DivergedError
 
     with bar("simulating", total=count, unit="frame") as progress:
         try:
-            for position_N3 in simulated:
-                yield position_N3
+            for position_N3 in frames:
+                take(position_N3)
                 progress.update()
         except DivergedError as error:
             raise ConfigError(f"weights must simulate without divergence, got {weights}: {error}") from error

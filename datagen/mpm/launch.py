@@ -353,16 +353,20 @@ class Launch(ABC):
         completed so far [B].
         """
 
-    def run(self, frames: int, on_frame: Callable[[int], None] | None, children: int) -> list[Simulated | SceneFailure]:
+    def run(
+        self, trajectory: Sequence[np.ndarray], on_frame: Callable[[int], None] | None, children: int
+    ) -> list[Simulated | SceneFailure]:
         """Returns the frames of each scene, the initial state included, or why the scene was stopped.
 
-        Trajectories contain the first of each `children` particles, counters count all particles.
+        `trajectory` are the arrays for the frames of each scene, see `Simulated`. They contain the first of each
+        `children` particles, counters count all particles. `on_frame` is called up to the last completed frame.
         """
+        frames = len(trajectory[0])
         every = [slice(*pair) for pair in pairwise(self.particle_begin)]
         first = [slice(particles.start, particles.stop, children) for particles in every]
-        trajectory = [np.empty((frames, len(self.entry_frame[visible]), 3), np.float32) for visible in first]
-        for rows, scene in zip(trajectory, self.scenes, strict=True):
+        for rows, scene, visible in zip(trajectory, self.scenes, first, strict=True):
             rows[0] = scene.position_N3[::children]
+            rows[0, self.entry_frame[visible] > 0] = np.nan
         last = np.concatenate([scene.position_N3 for scene in self.scenes])
         if on_frame is not None:
             on_frame(0)
@@ -370,17 +374,17 @@ class Launch(ABC):
         for position, completed in self._advance(frames - 1):
             for rows, visible in zip(trajectory, first, strict=True):
                 rows[present : present + len(position)] = position[:, visible]
+                for frame in range(present, min(present + len(position), self.entry_frame[visible].max())):
+                    rows[frame, self.entry_frame[visible] > frame] = np.nan
                 # first touches of memory take seconds, and a GPU would wait for them after its last frames
                 rows[present + len(position) : present + 2 * len(position)] = 0
-            for frame in range(present, present + len(position)):
+            for frame in range(present, min(present + len(position), completed.max() + 1)):
                 if on_frame is not None:
                     on_frame(frame)
             present += len(position)
             last[:] = position[-1]
             if (completed < present - 1).all():
                 break
-        for rows, visible in zip(trajectory, first, strict=True):
-            rows[np.arange(frames)[:, None] < self.entry_frame[visible]] = np.nan
         status = self.counter.to_numpy()[:, COUNT.status]
         counters = self._counters()
         for index, (own, collider) in enumerate(zip(counters, self.colliders, strict=True)):

@@ -63,6 +63,7 @@ def simulate(
     team: Team | None = None,
     stability_fractions: Sequence[float] | None = None,
     children: int = 1,
+    trajectories: Sequence[np.ndarray] | None = None,
 ) -> list[Simulated | SceneFailure]:
     """Simulates `scenes` together, and returns `frames` frames of each, the initial state included.
 
@@ -75,6 +76,7 @@ def simulate(
 
     Scenes with emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
     called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.
+    `trajectories` are arrays for the frames of each scene, which contain frame t of a single scene in `on_frame(t)`.
     `cpu_threads` applies to the process's first simulation (see `initialise`). `colliders` are results of
     `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: it is
     chosen by device and scenes. `stability_fractions` replace the config's. Results contain the first of each
@@ -109,9 +111,10 @@ def simulate(
 
     device = initialise(config.device, cpu_threads)
     occupied = [index for index, scene in enumerate(scenes) if scene.particle_count]
-    results: list[Simulated | SceneFailure] = [
-        Simulated(np.empty((frames, 0, 3), np.float32), no_counters()) for _ in scenes
-    ]
+    if trajectories is None:
+        counts = [len(range(0, scene.particle_count, children)) for scene in scenes]
+        trajectories = [np.empty((frames, count, 3), np.float32) for count in counts]
+    results: list[Simulated | SceneFailure] = [Simulated(path_TN3, no_counters()) for path_TN3 in trajectories]
     step_s = config.fixed_time_step_s
     moving = any(scenes[i].moves for i in occupied)
     require_slow(scenes, frame_rate_hz)
@@ -133,7 +136,7 @@ def simulate(
             [fractions[i] for i in group],
         )  # fmt: skip
         own_team = Team(0) if group is single else team or _team(device, [scene.particle_count for scene in batch[0]])
-        outcomes = _launched(device, own_team, batch, frames, report, children)
+        outcomes = _launched(device, own_team, batch, [trajectories[i] for i in group], report, children)
         for index, outcome in zip(group, outcomes, strict=True):
             results[index] = outcome
         before += frames * len(group)
@@ -144,24 +147,31 @@ def simulate(
 
 
 def _launched(
-    device: Device, team: Team, batch: tuple[Any, ...], frames: int, on_frame: Callable[[int], None], children: int
+    device: Device,
+    team: Team,
+    batch: tuple[Any, ...],
+    paths: Sequence[np.ndarray],
+    on_frame: Callable[[int], None],
+    children: int,
 ) -> list[Simulated | SceneFailure]:
     with _arrays_freed_here():
         if team.threads:
             try:
-                return _run(TeamLaunch(team, _teams_at_once(device, team), *batch), frames, on_frame, children)
+                return _run(TeamLaunch(team, _teams_at_once(device, team), *batch), paths, on_frame, children)
             except BlocksApartError:
                 warnings.warn(
                     f"the {device.kind} does not run the {team.blocks} blocks of {team.threads} threads of a scene "
                     "concurrently, so each substep is a separate launch, which is slower; end other programs on the "
                     "device", RuntimeWarning, stacklevel=3,
                 )  # fmt: skip
-        return _run(GridLaunch(device, *batch), frames, on_frame, children)
+        return _run(GridLaunch(device, *batch), paths, on_frame, children)
 
 
-def _run(launch: Launch, frames: int, on_frame: Callable[[int], None], children: int) -> list[Simulated | SceneFailure]:
+def _run(
+    launch: Launch, paths: Sequence[np.ndarray], on_frame: Callable[[int], None], children: int
+) -> list[Simulated | SceneFailure]:
     try:
-        return launch.run(frames, on_frame, children)
+        return launch.run(paths, on_frame, children)
     finally:
         launch.release()
 

@@ -9,7 +9,7 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
 from hgn.scene.rollout_file import (
     Rollout,
+    Simulation,
     frame_velocity,
     raise_interruption,
     rollout_bytes,
@@ -75,16 +76,16 @@ def save_rollout(
     return written[0]
 
 
-def save_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray], surface: bool = False) -> Path:
-    """Writes `frames` as they are simulated, and stores them in `rollout.position_TN3`. Formats: see `save_rollout`.
+def save_frames(path: Path, rollout: Rollout, simulate: Simulation, surface: bool = False) -> Path:
+    """Writes frames as they are simulated, and stores them in `rollout.position_TN3`. Formats: see `save_rollout`.
 
     USD and PLY are written after the last frame; after Ctrl-C they contain the frames so far.
     """
     if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
-        write_frames(path, rollout, frames)
+        write_frames(path, rollout, simulate)
         return path
     with space_reserved(path, rollout_bytes(rollout.frame_count, rollout.particle_count)):
-        count, interruption = take_frames(rollout, frames)
+        count, interruption = take_frames(rollout, simulate)
     written = save_rollout(path, replace(rollout, position_TN3=rollout.position_TN3[:count]), surface)
     raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {written}")
     return written

@@ -20,7 +20,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -43,8 +43,7 @@ FORMAT_VERSION = 2  # version 1 had no obstacles in /VTKHDF
 OBSTACLE_MATERIAL = 255
 MOTION_FIELDS = ("time_T", "translation_T3", "rotation_T33")
 VTKHDF_VERSION = (2, 0)  # the oldest version with temporal PolyData, for older ParaViews
-# corners of each kind of cells, in the order of Steps/CellOffsets
-CELL_CATEGORIES = {"Vertices": 1, "Lines": 1, "Polygons": 3, "Strips": 1}
+CELL_CATEGORIES = {"Vertices": 1, "Lines": 1, "Polygons": 3, "Strips": 1}  # corners, in the order of Steps/CellOffsets
 WRITE_EVERY_S = 1.0  # interval between writes of a growing file
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FARTHEST = 1000  # largest coordinate of particles in a file, in domain sizes; a simulation diverges before
@@ -52,6 +51,7 @@ FARTHEST = 1000  # largest coordinate of particles in a file, in domain sizes; a
 KINDS = {"VTKHDF/Points": "f", "VTKHDF/NumberOfPoints": "iu", "hgn/reference": "f", "hgn/entry_frame": "iu"}
 TRIANGLE_BYTES = 1000  # about the memory that a picture takes for a triangle
 FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
+Simulation = Callable[[Callable[[np.ndarray], None]], None]  # gives each frame to a function, float32 [present, 3]
 POINTS_OF_A_WRITE = 1_000_000  # points of the frames that are in memory together; each takes about 100 bytes
 
 
@@ -145,8 +145,8 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
         frames.write(rollout.frame_count)
 
 
-def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> None:
-    """Writes frames as they come, float32 [present particles, 3], and puts them into `rollout.position_TN3`.
+def write_frames(path: Path, rollout: Rollout, simulate: Simulation) -> None:
+    """Writes the frames of `simulate` as they come, and puts them into `rollout.position_TN3`.
 
     Once a second the new frames are appended to a temporary file. The file is renamed to `path` at the end, also after
     Ctrl-C, an OSError or a ConfigError. Other errors leave no file. The space for all frames is reserved first.
@@ -160,27 +160,30 @@ def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> 
                 release(size * (count - file.count) // rollout.frame_count)
                 file.write(count)
 
-        count, interruption = take_frames(rollout, frames, append)
+        count, interruption = take_frames(rollout, simulate, append)
         release(size)
         file.write(count)
     raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {path}")
 
 
 def take_frames(
-    rollout: Rollout, frames: Iterable[np.ndarray], each: Callable[[int], None] | None = None
+    rollout: Rollout, simulate: Simulation, each: Callable[[int], None] = lambda _: None
 ) -> tuple[int, BaseException | None]:
-    """Puts frames into `rollout.position_TN3`, and calls `each` with their number so far.
+    """Puts the frames of `simulate` into `rollout.position_TN3`, and calls `each` with their number so far.
 
     Returns the number of frames, and the interruption (Ctrl-C, an error of the disk or a ConfigError) or None. An
     interruption before the second frame is raised.
     """
     count = 0
+
+    def take(position_N3: np.ndarray) -> None:
+        nonlocal count
+        rollout.position_TN3[count, : len(position_N3)] = position_N3
+        count += 1
+        each(count)
+
     try:
-        for position_N3 in frames:
-            rollout.position_TN3[count, : len(position_N3)] = position_N3
-            count += 1
-            if each is not None:
-                each(count)
+        simulate(take)
     except (KeyboardInterrupt, OSError, ConfigError) as error:
         if count < 2:  # frame 0 is the initial state
             raise
@@ -211,19 +214,15 @@ def _growing_file(path: Path, rollout: Rollout) -> Iterator[_GrowingFile]:
 
 
 def read_rollout(path: str | Path) -> Rollout:
-    """Reads a file of `write_rollout`.
-
-    Raises: ConfigError if the file is missing, damaged, or not a rollout of this version.
-    """
+    """Reads a file of `write_rollout`. Raises: ConfigError if it is missing, damaged, or not of this version."""
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"rollout must be an existing file, got {path}; python -m hgn.rollout writes one")
     rule, remedy = f"{path}: rollout must be a complete HDF5 file", "write it again"
-    claims = Claims(path)
     with open_hdf5(path, rule, remedy) as file:
         _check_format(file, path)
         try:
-            return _read(file, claims)
+            return _read(file, Claims(path))
         except ConfigError as error:
             raise ConfigError(f"{path}: rollout must be consistent, got {error}; {remedy}") from error
 

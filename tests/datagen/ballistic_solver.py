@@ -93,7 +93,7 @@ def warm_up(scene, config, scenes):
     pass
 
 
-def simulate(scenes, config, frames, frame_rate_hz, on_frame=None, cpu_threads=None, colliders=None, children=1):
+def simulate(scenes, config, frames, frame_rate_hz, on_frame=None, children=1, trajectories=(), **_):
     results: list[Simulated | SceneFailure] = []
     for scene in scenes:
         with control("simulated.log").open("a") as log:
@@ -121,6 +121,8 @@ def simulate(scenes, config, frames, frame_rate_hz, on_frame=None, cpu_threads=N
         position = scene.position_N3 + time_T11 * scene.velocity_N3 + 0.5 * time_T11**2 * np.array(scene.gravity)
         position = position[:, ::children]
         results.append(Simulated(position.astype(np.float32), {"substeps": frames}))
+    for path_TN3, result in zip(trajectories, results, strict=False):
+        path_TN3[:] = result.position_TN3
     if on_frame is not None:
         for frame in range(frames):
             on_frame(frame)

@@ -114,6 +114,7 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     out = str(tmp_path / "a.vtkhdf")
     assert rollout.main({"weights": weights, "frames": 2, "scene": str(tmp_path / "stiff.yaml"), "out": out}) == 0
     said = capsys.readouterr().err
+    assert re.search(r"^\d+ particles, 2 frames$", said, re.MULTILINE)
     assert "no effect: youngs_modulus_pa of groups; still simulates each material with the solver's" in said
     assert "a sheet, not a solid, because it is not watertight: open.obj; close its" in said and "square" not in said
     assert "no effect: friction of surfaces; still simulates that of its data, own_physics the scene's" in said

@@ -47,13 +47,13 @@ def test_refused_data(tmp_path, monkeypatch, request, refused, how, size, lastin
         path.unlink()
         monkeypatch.setattr(rollout_file, "take_frames", lambda *rest: (take_frames(*rest), file_limit(None))[0])
 
-    def frames():
+    def simulate(take):
         for frame, position_N3 in enumerate(whole.position_TN3):
             if frame == refused:
                 file_limit(size)
-            yield position_N3[: whole.present(frame)]
+            take(position_N3[: whole.present(frame)])
 
     with pytest.raises(OSError, match=r"File too large|Illegal seek"):
-        write_frames(path, dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan)), frames())
+        write_frames(path, dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan)), simulate)
     np.testing.assert_equal(contents(path), expected)
     assert [each.name for each in tmp_path.iterdir()] == ["a.vtkhdf"]

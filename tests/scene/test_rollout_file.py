@@ -396,7 +396,7 @@ def test_files_grow(tmp_path, monkeypatch):
     whole, path = growing(), tmp_path / "new" / "grown.vtkhdf"
     empty = dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan))
 
-    def frames():
+    def simulate(take):
         for count, frame_N3 in enumerate(whole.position_TN3):
             if count:
                 (temporary,) = filter(h5py.is_hdf5, path.parent.iterdir())
@@ -404,9 +404,9 @@ def test_files_grow(tmp_path, monkeypatch):
                 write_rollout(tmp_path / "part", dataclasses.replace(whole, position_TN3=whole.position_TN3[:count]))
                 np.testing.assert_equal(contents(tmp_path / "copy"), contents(tmp_path / "part"))
             assert not path.exists()
-            yield frame_N3[: whole.present(count)]
+            take(frame_N3[: whole.present(count)])
 
-    write_frames(path, empty, frames())
+    write_frames(path, empty, simulate)
     write_rollout(tmp_path / "whole", whole)
     np.testing.assert_equal(contents(path), contents(tmp_path / "whole"))
     np.testing.assert_array_equal(empty.position_TN3, whole.position_TN3)
@@ -422,13 +422,13 @@ def test_interrupted_files(tmp_path, error, monkeypatch, capsys):
     whole, path = growing(), tmp_path / "a.vtkhdf"
     write_rollout(path, make_rollout())
 
-    def frames(count):
-        yield from (frame_N3[: whole.present(i)] for i, frame_N3 in enumerate(whole.position_TN3[:count]))
+    def simulate(take):
+        list(map(take, whole.position_TN3[:count]))
         raise error
 
     for count in (0, 1, 4):
         with pytest.raises(type(error)):
-            write_frames(path, dataclasses.replace(whole, position_TN3=whole.position_TN3.copy()), frames(count))
+            write_frames(path, dataclasses.replace(whole, position_TN3=whole.position_TN3.copy()), simulate)
         kept = count == 4 and type(error) is not ValueError
         assert read_rollout(path).frame_count == (count if kept else FRAMES)
         assert capsys.readouterr().err == (f"4 of 6 frames are in {path}\n" if kept else "")
@@ -439,7 +439,7 @@ def test_interrupted_files(tmp_path, error, monkeypatch, capsys):
             rollout_file, "_extend", lambda group, name, *rest: _fails(errors, name) or extend(group, name, *rest)
         )
         with pytest.raises(OSError, match="No space"):
-            write_frames(path, whole, iter(whole.position_TN3))
+            write_frames(path, whole, lambda take: list(map(take, whole.position_TN3)))
         np.testing.assert_array_equal(read_rollout(path).position_TN3, whole.position_TN3[:3])
     assert [each.name for each in tmp_path.iterdir()] == ["a.vtkhdf"]
 

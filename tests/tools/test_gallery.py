@@ -393,10 +393,11 @@ def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
     path, weights = tiny_file(tmp_path), still_weights(tmp_path)
     monkeypatch.setattr(render, "scene_files", lambda folder: {"tiny": path})
 
-    def falls(scenes, config, frames, rate_hz, on_frame):
+    def falls(scenes, config, frames, rate_hz, on_frame, trajectories):
         time_T11 = np.arange(frames)[:, None, None] / rate_hz
         falls_T3 = 0.5 * time_T11**2 * np.array(scenes[0].gravity)
-        return [RolloutResult((scenes[0].position_N3 + falls_T3).astype(np.float32))]
+        trajectories[0][:] = scenes[0].position_N3 + falls_T3
+        return [RolloutResult(trajectories[0])]
 
     monkeypatch.setattr("datagen.mpm.solver.simulate", falls)
     options = {"rollout": "tiny", "others": [weights], "out": str(tmp_path / "pictures"), "every": 5, "size": 64}

@@ -37,7 +37,7 @@ def states(scene, config, frames, *fields, rate_hz=FRAME_RATE_HZ):
             if frame:
                 values.append(getattr(launch, name).to_numpy().astype(np.float64))
 
-    launch.run(frames, keep, 1)
+    launch.run([np.empty((frames, scene.particle_count, 3), np.float32)], keep, 1)
     launch.release()
     return [np.stack(values) for values in seen]
 
