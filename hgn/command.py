@@ -75,8 +75,10 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     code: int | str | None
     try:
         try:
-            with _ended_as_by_ctrl_c():
+            with _ended_as_by_ctrl_c() as received:
                 code = _exit_code(main, config_name)
+            if code == EXIT_INTERRUPTED and received:  # a library raised another KeyboardInterrupt, without the number
+                code = 128 + received[0]
         except SystemExit as end:  # Hydra ends the process after --help
             code = end.code
         sys.stdout.flush()
@@ -92,16 +94,21 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
 
 
 @contextmanager
-def _ended_as_by_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM and SIGHUP raise KeyboardInterrupt with their number. Ignored ones (nohup) stay ignored."""
+def _ended_as_by_ctrl_c() -> Iterator[list[int]]:
+    """Lets SIGTERM and SIGHUP raise KeyboardInterrupt with their number. Ignored ones (nohup) stay ignored.
+
+    Yields the list of received numbers.
+    """
+    received: list[int] = []
 
     def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        received.append(number)
         raise KeyboardInterrupt(number)
 
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
     before = {number: signal.signal(number, interrupt) for number in numbers}
     try:
-        yield
+        yield received
     finally:
         for number, handler in before.items():
             if signal.getsignal(number) is interrupt:  # a training's own handlers stay until the process ends

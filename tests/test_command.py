@@ -138,15 +138,20 @@ def test_full_disk_of_the_output(streams, main, code):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals(tmp_path, command, number):
-    """Each command ends on a signal as on Ctrl-C: with a line and its exit code, and without temporary files."""
+@pytest.mark.parametrize("passed_on", [True, False])
+def test_signals(tmp_path, command, number, passed_on):
+    """Each command ends on a signal as on Ctrl-C: with a line and its exit code, and without temporary files. The code
+    does not depend on libraries, some of which raise an interruption of their own in place of ours."""
 
     def interrupted(_):
         with temporary_file(tmp_path / "a") as temporary:
             temporary.touch()
             if number == signal.SIGINT:  # which shells ignore in the background
                 raise KeyboardInterrupt
-            signal.raise_signal(number)
+            try:
+                signal.raise_signal(number)
+            except KeyboardInterrupt as interruption:
+                raise interruption if passed_on else KeyboardInterrupt from None
 
     before = signal.getsignal(number)
     code, _, error = command("bench", main=interrupted)
