@@ -32,10 +32,10 @@ _INDICES = (5121, 5123, 5125)
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
-def read_glb(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def read_glb(path: Path, data: bytes, claims: Claims) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices, float64 [V, 3], and triangles, int64 [F, 3], of the file's scene.
 
-    `data` is the content of `path`.
+    `data` is the content of `path`, and `claims` are those of this reading.
     Raises: ValueError, LookupError, TypeError, struct.error or OSError for damaged, missing or unsupported data.
     """
     tree, binary = _chunks(data)
@@ -46,7 +46,6 @@ def read_glb(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     least = asset.get("minVersion", "2.0" if str(asset.get("version", 2)).startswith("2") else asset["version"])
     if least != "2.0":
         raise ValueError(f"it needs glTF {least}, but only 2.0 is supported; export it as glTF 2.0")
-    claims = Claims(path)
     file = _File(tree, binary, path.parent, claims)
     vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for mesh, weights, place_M44 in file.placed():

@@ -6,6 +6,7 @@ Shape legend: V vertices, U distinct vertices, F triangles, E directed triangle 
 from __future__ import annotations
 
 import codecs
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, near_file, no_file, require, require_vector
+from hgn.system.claims import Claims
 from hgn.system.files import errors_name
 
 _FACET = re.compile(
@@ -39,6 +41,7 @@ _PART_OF_FACET = re.compile(rb"\bfacet\s+normal\b.*|^[^\S\n]*(facet|outer|vertex
 _BINARY_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 SEAM = 1e-5  # largest distance of vertices at open edges that are joined, relative to the mesh's longest side
+PLACED_BYTES = 64  # bytes that a vertex or a triangle of a placed mesh counts as
 MOST_NEAR = 10  # mean number of vertices in cells of this size above which none are joined, because pairs take memory
 
 
@@ -59,6 +62,7 @@ def load_bodies(
     scale: float = 1.0,
     translation: Vector = (0.0, 0.0, 0.0),
     rotation: Vector = (0.0, 0.0, 0.0),
+    surfaces: Surfaces | None = None,
 ) -> tuple[Obstacle, ...]:
     """Reads a mesh file as a solid of its watertight bodies, a sheet of its other triangles, or both.
 
@@ -74,7 +78,7 @@ def load_bodies(
     require(0 < scale < np.inf, f"{field}: scale", "a finite number > 0", scale)
     for name, value in (("translation", translation), ("rotation", rotation)):
         require_vector(f"{field}: {name}", value)
-    vertex_V3, triangle_F3 = _read(path, field)
+    vertex_V3, triangle_F3 = (surfaces or Surfaces()).read(path, field)
     bad = np.flatnonzero(~np.isfinite(vertex_V3).all(axis=1))
     if len(bad):
         raise ConfigError(
@@ -107,8 +111,29 @@ def load_bodies(
     return tuple(parts)
 
 
+class Surfaces:
+    """The surfaces of mesh files, each read once. `most` limits the bytes that they count as together, because each
+    pair of corners of concave faces, and each placed vertex and triangle, takes time.
+    """
+
+    def __init__(self, most: float = np.inf) -> None:
+        self._surfaces: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._most, self._used = most, 0
+
+    def read(self, path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
+        """Returns vertices, float64 [V, 3], and a copy of triangles, int64 [F, 3]. Raises: ConfigError."""
+        if (name := os.path.realpath(path)) not in self._surfaces:
+            vertex_V3, triangle_F3, claims = _read(path, field)
+            self._surfaces[name], self._used = (vertex_V3, triangle_F3), self._used + claims.used
+        vertex_V3, triangle_F3 = self._surfaces[name]
+        self._used += PLACED_BYTES * (len(vertex_V3) + len(triangle_F3))
+        rule = f"of at most {self._most} bytes with the meshes before it, each counted as often as it is named"
+        require(self._used <= self._most, field, rule, self._used, "join entries of one file, or simplify the file")
+        return vertex_V3, triangle_F3.copy()
+
+
 @np.errstate(all="ignore")  # numbers that are not finite are refused
-def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
+def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray, Claims]:
     if not is_mesh_file(path):
         endings = ", ".join((*MESH_SUFFIXES, *USD_ENDINGS))
         remedy = "convert the mesh" if path.is_file() else near_file(path) or "convert the mesh"
@@ -118,7 +143,8 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     with errors_name(path):
         data = b"" if path.suffix.lower() in USD_ENDINGS else path.read_bytes()
     try:
-        vertex, triangle = (read_glb if path.suffix.lower() == ".glb" else _read_polygons)(path, data)
+        claims = Claims(path)
+        vertex, triangle = (read_glb if path.suffix.lower() == ".glb" else _read_polygons)(path, data, claims)
     except (ConfigError, ModuleNotFoundError):
         raise
     except Exception as error:  # damaged files raise any kind of error
@@ -132,10 +158,10 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
             f"{field} must have triangles whose indices are below {len(vertex)}, its vertices, got {triangle.min()} to "
             f"{triangle.max()} in {path}; export the mesh again"
         )
-    return vertex, triangle
+    return vertex, triangle, claims
 
 
-def _read_polygons(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _read_polygons(path: Path, data: bytes, claims: Claims) -> tuple[np.ndarray, np.ndarray]:
     """Reads STL, OBJ, PLY and USD."""
     kind = path.suffix[1:].lower()
     if kind == "stl":
@@ -143,7 +169,7 @@ def _read_polygons(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         return vertex_V3, np.arange(len(vertex_V3)).reshape(-1, 3)
     readers = {"obj": polygons_of_obj, "ply": polygons_of_ply}
     vertex_V3, faces = readers[kind](data) if kind in readers else read_usd_polygons(path)
-    if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
+    if (cut_F3 := concave_cut(vertex_V3, faces, claims)) is not None:
         return vertex_V3, cut_F3
     if kind == "obj" and len({len(face) for face in faces}) > 1:
         return vertex_V3, fans(faces)

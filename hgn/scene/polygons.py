@@ -13,9 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from hgn.system.claims import Claims
+
 FLAT = 1e-9  # smallest turn at a corner that counts as concave, as a fraction of the polygon's area
 # Largest number of corners of a concave face. The time of a cut grows with its square; the sum of squares is limited.
 MAXIMUM_CORNERS = 2_000
+PAIR_BYTES = 16  # bytes that a pair of corners of a concave face counts as, because each takes time
 _LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE | re.IGNORECASE)
 _SPACES = bytes.maketrans(b"\r\f\v", b"\n  ")
 _UTF_16 = re.compile(rb"\xff\xfe|\xfe\xff|[^\0]\0[^\0]\0|\0[^\0]\0[^\0]")
@@ -192,17 +195,20 @@ class _Numbers:
         return np.stack([rows[name].astype(np.float64) for name in dtype.names or ()], axis=1)
 
 
-def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | None:
-    """Returns the triangles of all faces, int64 [F, 3], or None if no face is concave.
+def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray], claims: Claims) -> np.ndarray | None:
+    """Returns the triangles of all faces, int64 [F, 3], or None if no face is concave. Adds their pairs of corners to
+    `claims`.
 
     Raises: ValueError naming a face whose edges cross or touch, or if concave faces have too many corners.
     """
     concave = _concave(vertex_V3, faces)
     if not concave:
         return None
-    if sum(face_MK.size * face_MK.shape[1] for _, face_MK in concave) > MAXIMUM_CORNERS**2:
+    pairs = sum(face_MK.size * face_MK.shape[1] for _, face_MK in concave)
+    if pairs > MAXIMUM_CORNERS**2:
         count, largest = sum(len(face_MK) for _, face_MK in concave), max(face_MK.shape[1] for _, face_MK in concave)
         raise ValueError(f"it has {count} concave faces, of up to {largest} corners; cut them into triangles")
+    claims.add("concave faces", pairs, PAIR_BYTES)
     cut: dict[int, np.ndarray] = {}
     for number_M, face_MK in concave:
         corner_MF3 = _ears(_flattened(vertex_V3[face_MK]), number_M)

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,12 +41,13 @@ from hgn.schema import (
     require_bounds,
     to_mapping,
 )
+from hgn.system.claims import most_bytes
 from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
 MAXIMUM_ENTRIES = 256  # entries are obstacles, or groups and emitters
-# limit of the bytes of files, each counted as often as a scene names it: FILES_BYTES, or REPEATS times the bytes of the
-# files counted once, if that is more
+# limit of the bytes of files of particles, each counted as often as a scene names it: FILES_BYTES, or REPEATS times the
+# bytes of the files counted once, if that is more
 FILES_BYTES, REPEATS = 12 << 20, 8
 MEASURE = "measure"  # section of files in conf/gallery that tools.stability reads
 MILLIMETRES = "a file in millimetres needs scale: 0.001"
@@ -290,8 +291,8 @@ def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
 
 def _build(file: SceneFile, folder: Path) -> Scene:
     whole_cells(file.domain_size, file.cell_size)
-    _require_few_repeats(file, folder)
-    bodies = [_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles)]
+    _require_few_repeats([entry.particles for entry in file.groups], folder)
+    bodies = list(_obstacles(file.obstacles, folder))
     # sheets of partly watertight meshes come last, so that entry i has obstacle i
     obstacles = (*(first for first, *_ in bodies), *(sheet for _, *others in bodies for sheet in others))
     rule = f"at most {MOST_PARTICLES} particles together, with those of emitters"
@@ -364,35 +365,45 @@ def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> 
     return {name: np.repeat(np.array(column, np.float32), counts) for name, column in columns.items()}
 
 
-def _require_few_repeats(file: SceneFile, folder: Path) -> None:
+def _sizes(names: Iterable[str | None], folder: Path) -> list[tuple[Path, int]]:
+    paths = [(folder / name).resolve() for name in names if name and (folder / name).is_file()]
+    return [(path, path.stat().st_size) for path in paths]
+
+
+def _require_few_repeats(particles: Iterable[str | None], folder: Path) -> None:
     """Raises ConfigError for files that together would take minutes and gigabytes, because they are named often."""
-    named = [entry.mesh for entry in file.obstacles] + [entry.particles for entry in file.groups]
-    paths = [folder / name for name in named if name and (folder / name).is_file()]
-    size = sum(path.stat().st_size for path in paths)
-    most = max(FILES_BYTES, REPEATS * sum(path.stat().st_size for path in {*paths}))
+    sizes = _sizes(particles, folder)
+    size, most = sum(size for _, size in sizes), max(FILES_BYTES, REPEATS * sum(dict(sizes).values()))
     rule = f"of at most {most} bytes together, each counted as often as it is named"
-    require(size <= most, "mesh and particles", rule, size, "join entries of one file, or simplify the file")
+    require(size <= most, "particles", rule, size, "join entries of one file, or simplify the file")
 
 
-def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle, ...]:
-    if entry.mesh is None:
-        assert entry.shape is not None and entry.size is not None and entry.position is not None
-        name = f"obstacle_{index}_{entry.shape}"
-        bodies: tuple[Obstacle, ...] = (
-            shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name),
-        )
-    else:
-        # it imports parts of SciPy that few scenes need
-        from hgn.scene.mesh import load_bodies
+def _obstacles(entries: Sequence[ObstacleEntry], folder: Path) -> Iterator[tuple[Obstacle, ...]]:
+    """Yields the obstacles of each entry: one, or two for a mesh with watertight bodies and other triangles."""
+    surfaces: Any = None
+    for index, entry in enumerate(entries):
+        if entry.mesh is None:
+            assert entry.shape is not None and entry.size is not None and entry.position is not None
+            name = f"obstacle_{index}_{entry.shape}"
+            bodies: tuple[Obstacle, ...] = (
+                shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name),
+            )
+        else:
+            # it imports parts of SciPy that few scenes need
+            from hgn.scene.mesh import Surfaces, load_bodies
 
-        bodies = load_bodies(
-            folder / entry.mesh,
-            f"obstacles[{index}].mesh",
-            scale=1.0 if entry.scale is None else entry.scale,
-            translation=entry.position or (0.0, 0.0, 0.0),
-            rotation=entry.rotation,
-        )
-    return tuple(dataclasses.replace(body, friction=entry.friction, motion=entry.motion) for body in bodies)
+            # half, because cuts of concave faces, which count least for their time, take about 10 s for 12 MB
+            size = sum(dict(_sizes((each.mesh for each in entries), folder)).values()) // 2
+            surfaces = surfaces or Surfaces(most_bytes(size))
+            bodies = load_bodies(
+                folder / entry.mesh,
+                f"obstacles[{index}].mesh",
+                scale=1.0 if entry.scale is None else entry.scale,
+                translation=entry.position or (0.0, 0.0, 0.0),
+                rotation=entry.rotation,
+                surfaces=surfaces,
+            )
+        yield tuple(dataclasses.replace(body, friction=entry.friction, motion=entry.motion) for body in bodies)
 
 
 def _require_clear(name: str, position_N3: np.ndarray, obstacles: Sequence[Obstacle], file: SceneFile) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hgn.scene.npz import read_npz
-from hgn.system.claims import EXPANSION, SMALL_BYTES
+from hgn.system.claims import most_bytes
 from hgn.system.extras import require_installed
 
 COPIES = 4  # arrays of pxr, of NumPy, joined, and as npz
@@ -34,7 +34,7 @@ def read_usd_particles(path: Path, material: str) -> dict[str, np.ndarray]:
 def _read(content: str, path: Path, *more: str) -> dict[str, np.ndarray]:
     """Raises: ValueError for unsupported, damaged or too large content; ModuleNotFoundError without pxr."""
     require_installed("pxr")
-    most = max(SMALL_BYTES, EXPANSION * path.stat().st_size)
+    most = most_bytes(path.stat().st_size)
     program = [sys.executable, "-P", str(Path(__file__).with_name("usd_program.py"))]
     one_thread = dict(os.environ, PXR_WORK_THREAD_LIMIT="1", OPENBLAS_NUM_THREADS="1")  # each thread takes memory
     arguments = [content, str(path.resolve()), str(COPIES * most), *more]

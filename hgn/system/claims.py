@@ -15,23 +15,28 @@ ITEM_BYTES = 400  # bytes that an operation of a pickle counts as, because each 
 MOST_ITEMS = 10_000_000  # largest number of items of nested lists, with references resolved
 
 
+def most_bytes(file_bytes: int) -> int:
+    """Returns the bytes that the content of a file of this size may claim."""
+    return max(SMALL_BYTES, EXPANSION * file_bytes)
+
+
 class Claims:
     """Adds up the bytes that the content of a file claims. Each reading of a file needs one object."""
 
     def __init__(self, file: Path | str, file_bytes: int | None = None) -> None:
         self._file = file
         self._file_bytes = Path(file).stat().st_size if file_bytes is None else file_bytes
-        self._most = self.left = max(SMALL_BYTES, EXPANSION * self._file_bytes)
+        self.most, self.used = most_bytes(self._file_bytes), 0
 
     def add(self, name: object, *counts: int) -> None:
         """Adds the product of `counts`. The last count is the size of an item.
 
         Raises ConfigError with the file and `name` when the sum exceeds the possible content of the file.
         """
-        self.left -= math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self._most + 1
-        if self.left < 0:
+        self.used += math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self.most + 1
+        if self.used > self.most:
             raise ConfigError(
-                f"{self._file}: {name} must keep the content within {self._most} bytes, because the file has "
+                f"{self._file}: {name} must keep the content within {self.most} bytes, because the file has "
                 f"{self._file_bytes}, got {' x '.join(map(str, counts))[:200]} more; write or fetch the file again"
             )
 
@@ -52,7 +57,7 @@ def require_plain_pickle(data: bytes, claims: Claims, names: re.Pattern[str] = r
     for operation, argument, _ in pickletools.genops(data):
         name, text = operation.name, argument if isinstance(argument, (bytes, bytearray, str)) else b""
         total += ITEM_BYTES
-        if total > claims.left:
+        if total > claims.most - claims.used:
             claims.add("its pickle", total)
         if "PUT" in name and int(argument or 0) > len(data):
             raise ValueError(f"a memo of {argument} objects in a pickle of {len(data)} bytes")

@@ -13,13 +13,13 @@ import traceback
 import warnings
 from pathlib import Path
 
-from data import strange_data
+from data import strange_data, strange_scenes
 from data.strange_files import CASES
 
 from hgn.schema import ConfigError
 
 MEMORY_BYTES, CPU_S = 2 * 10**9, 20
-assert strange_data
+assert strange_data and strange_scenes
 
 
 def outcome(name, folder):

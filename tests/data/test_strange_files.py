@@ -6,11 +6,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from data import strange_data
+from data import strange_data, strange_scenes
 from data.strange_files import CASES
 
 TESTS = Path(__file__).parents[1]
-assert strange_data  # which adds its files to CASES
+assert strange_data and strange_scenes  # which add their files to CASES
 READ = {  # files that hold what they claim
     "mesh: primitives", "mesh: instances", "mesh: targets", "mesh: obj of polygons",
     "mesh: cloud of triangles", "mesh: obj of groups", "mesh: obj of pentagons", "mesh: obj of a spiral",

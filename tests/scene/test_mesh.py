@@ -341,7 +341,7 @@ def test_convex_faces_are_left_to_the_reader():
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
     square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.2), (0, 1, 0)], float)
     for points in (ring, 1e-3 * ring + 5, square):
-        assert concave_cut(points, [np.arange(len(points))]) is None
+        assert concave_cut(points, [np.arange(len(points))], None) is None
 
 
 CUBE = trimesh.creation.box(bounds=((0, 0, 0), (1, 1, 1)))
