@@ -37,6 +37,7 @@ _INTERNAL = (
 _INTERNAL += (
     "step_config.StepConfig",
     "runtime.torch_backend.Backend",
+    "scene.mesh.Surfaces",
     "scene.moving.MovingObstacle",
     "scene.obstacle_grid.ObstacleGrid",
     "scene.episode.Episode",

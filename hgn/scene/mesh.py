@@ -70,6 +70,7 @@ def load_bodies(
     beyond the domain. A body is watertight if it is orientable and exactly two triangles meet at each of its edges; its
     triangles get a consistent orientation. Open edges within SEAM of each other are joined for this check. After the
     check corners with equal float32 coordinates are merged, and zero-area and repeated triangles are removed.
+    Calls with the same `surfaces` read each file once, and share a limit.
 
     Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles, coordinates
     that are not finite, only zero-area triangles, or a bad scale, translation or rotation.
