@@ -25,9 +25,10 @@ import torch
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
+from hgn.data.sampler import SamplerState
 from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import open_storage
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, to_mapping
 from hgn.system import files
 from hgn.training.checkpoint import LAST_NAMES, SECTION, read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
@@ -194,7 +195,8 @@ class Checkpoints:
     def write(self, folder, promised):
         writer = CheckpointWriter()
         for updates in range(1, 5):
-            content = {SECTION: {"updates": updates}, "state_dict": {"weight": torch.full((64,), float(updates))}}
+            own = {"updates": updates, "sampler_state": to_mapping(SamplerState())}
+            content = {SECTION: own, "state_dict": {"weight": torch.full((64,), float(updates))}}
             writer.save_checkpoint(content, folder / "runs" / "one" / "checkpoints" / LAST_NAMES[0])
             writer.wait()
             promised["updates"] = updates

@@ -180,7 +180,7 @@ def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
           for name, value, kind, got in (
               ("velocity", 0.0, torch.float32, "0.0"), ("acceleration", -0.5, torch.float16, "-0.5"),
               ("velocity", 1e-300, torch.float64, "0.0"), ("acceleration", 1e-46, torch.float64, "0.0"),
-              ("acceleration", 1e-39, torch.bfloat16, "1.0.*e-39"), ("velocity", 1e-31, torch.float32, "9.9.*e-32"))),
+              ("acceleration", 2e-31, torch.bfloat16, ".*e-31"), ("velocity", 1e-31, torch.float32, "9.9.*e-32"))),
         *((info(**{name: value}), rf"weights\.{name}{at} must be {rule}, got {got}")
           for name, value, at, rule, got in (
               ("updates", -1, "", "a finite number >= 0", "-1"),
