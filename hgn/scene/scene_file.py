@@ -392,9 +392,10 @@ def _obstacles(entries: Sequence[ObstacleEntry], folder: Path) -> Iterator[tuple
             # it imports parts of SciPy that few scenes need
             from hgn.scene.mesh import Surfaces, load_bodies
 
-            # half, because cuts of concave faces, which count least for their time, take about 10 s for 12 MB
-            size = sum(dict(_sizes((each.mesh for each in entries), folder)).values()) // 2
-            surfaces = surfaces or Surfaces(most_bytes(size))
+            if surfaces is None:
+                # half, because cuts of concave faces, which count least for their time, take about 10 s for 12 MB
+                size = sum(dict(_sizes((each.mesh for each in entries), folder)).values()) // 2
+                surfaces = Surfaces(most_bytes(size))
             bodies = load_bodies(
                 folder / entry.mesh,
                 f"obstacles[{index}].mesh",
