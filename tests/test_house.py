@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 34_951,
     "datagen": 8_964,
     "tools": 6_296,
-    "tests": 36_786,
+    "tests": 36_789,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -66,7 +66,7 @@ cases(
         "no axis": scene_with(zipped({"position": ((10**18, 0, 3), "<f4", 0)})),
         "wide text": scene_with(zipped({"position": ((1,), "<U1000000000", 2**20)})),
         "many": scene_with(zipped({f"a{number}": ((2**18,), "<f4", 2**20) for number in range(70)})),
-        "a longer stream": scene_with(longer(zipped({"position": ((1, 3), "<f4", 700 * 2**20)}), 140)),
+        "a longer stream": scene_with(longer(zipped({"position": ((1, 3), "<f4", 400 * 2**20)}), 140)),
     },
     load_scene,
 )

@@ -120,7 +120,7 @@ cases(
         "keys of one hash": pickled(keys_of_one_hash()),
         "tuples of one hash": lambda folder: pickled(keys_of_one_hash(tuples=True))(folder),
         "an ordered dict of pairs": lambda folder: pickled(keys_of_one_hash(tuples=True, called=True))(folder),
-        "operations": lambda folder: pickled(b"\x80\2" + 6_000_000 * b"N0" + b"}.")(folder),
+        "operations": lambda folder: pickled(b"\x80\2" + 1_000_000 * b"N0" + b"}.")(folder),
         "memo": pickled(b"\x80\x02}r\xff\xff\xff\x7f."),
         "called storage": pickled(b"\x80\x02ctorch\nFloatStorage\n\x8a\x05\x00\xe8vH\x17\x85R."),
         "pipe": lambda folder: (os.mkfifo(folder / "c.ckpt"), folder / "c.ckpt")[1],

@@ -29,7 +29,7 @@ def outcome(name, folder):
     if child == 0:
         os.close(reader)
         resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
-        signal.alarm(60)  # for what waits instead
+        signal.alarm(600)  # for what waits instead
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
         warnings.simplefilter("error", RuntimeWarning)
         try:
