@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 34_951,
+    "hgn": 34_974,
     "datagen": 8_964,
     "tools": 6_296,
-    "tests": 36_789,
+    "tests": 36_828,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

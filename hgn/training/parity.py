@@ -2,11 +2,14 @@
 
 It compares the outputs, and for each parameter tensor the gradient of the mean absolute output, whose terms do not
 cancel. Gradients of a sum with random signs are badly conditioned: rounding to 11 bits changes them by up to 0.7.
+With friction the gradient of `relative.balanced` jumps where a body at rest or in motion is about to stick (k = 1 in
+hgn.network.own_physics), and rounding decides on which side it is. So the kernels' backward pass begins with PyTorch's
+output of the decoder, for which both are on the same side.
 No tensor may exceed its bound. The root mean square of all errors is compared with that of the changes in PyTorch when
 parameters change by up to ROUNDING, plus LEAST_CHANGE. Right kernels have at most 1.1 times this, and kernels whose
 backward pass lacks a direction of edges at least 2.6 times.
 
-Shape legend: N particles of all scenes, S scenes.
+Shape legend: N particles of all scenes, K outputs of the decoder, S scenes.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.update.op import Updates
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
+from hgn.network.grid import GridHierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
@@ -55,12 +59,17 @@ def require_update_parity(
     if moving is not None:
         moving = moving if symmetries is None else moving_under(moving, symmetries)
         state = replace(state, moving=moving.to(updates.device))
-    output_N3 = network.normalised_acceleration(state, origin_S3)
+    output_N3, decoded_NK = _predicted(network, state, origin_S3)
     weight_N3 = output_N3.detach().sign() * updates.share_N[:count, None]
-    expected = _gradients(network, output_N3, weight_N3)
+    (weight_NK,) = torch.autograd.grad(output_N3, decoded_NK, weight_N3, retain_graph=True)
+    expected = _gradients(network, decoded_NK, weight_NK)
     output_error = require_parity(
         fused.output[:count, :3], output_N3.detach(), OUTPUTS, updates.precision, section="training."
     )
+    if network.config.relative:
+        fused.grid.sum_C.zero_()
+        fused.output[:count, : decoded_NK.shape[1]] = decoded_NK.detach()
+        fused.grid.balance(fused.output, fused.particle_count)
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
@@ -68,7 +77,7 @@ def require_update_parity(
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
     errors = _errors(gradients, expected)
     rounded = _rounded(network)
-    changes = _errors(_gradients(rounded, rounded.normalised_acceleration(state, origin_S3), weight_N3), expected)
+    changes = _errors(_gradients(rounded, _predicted(rounded, state, origin_S3)[1], weight_NK), expected)
     together = replace(GRADIENTS, bound=CHANGES * (_rms(changes) + LEAST_CHANGE))
     for error, quantity in ((_rms(errors), together), (max(errors), GRADIENTS)):
         gradient_error = require_error(error, quantity, updates.precision, section="training.")
@@ -78,12 +87,26 @@ def require_update_parity(
     return output_error, gradient_error
 
 
+def _predicted(
+    network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the network's outputs and those of its decoder, from which `relative.balanced` computes them."""
+    decoded: list[torch.Tensor] = []
+
+    def propagate(particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
+        decoded.append(network.propagate(particle_NW, grid))
+        return decoded[0]
+
+    prediction = network.predicted(state, network.grid(state, origin_S3), propagate)
+    return prediction.acceleration_N3, decoded[0]
+
+
 def _gradients(
-    network: HierarchicalGraphNetwork, output_N3: torch.Tensor, weight_N3: torch.Tensor
+    network: HierarchicalGraphNetwork, decoded_NK: torch.Tensor, weight_NK: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Returns the gradients of the weighted sum of outputs with respect to the parameters."""
+    """Returns the gradients of the weighted sum of the decoder's outputs with respect to the parameters."""
     parameters = list(network.parameters())
-    gradients = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    gradients = torch.autograd.grad(decoded_NK, parameters, weight_NK, allow_unused=True)
     return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, gradients, strict=True)]
 
 

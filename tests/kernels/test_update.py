@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from kernels.engines import device
-from network.states import network_of, random_grid
+from network.states import GRAVITY, network_of, random_grid
 
 from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors
@@ -263,3 +263,42 @@ def test_a_wrong_gradient_of_any_tensor_is_refused(monkeypatch):
             totals[: updates.packed.size][(begin <= index) & (index < end)] *= factor
             with pytest.raises(ConfigError, match=r"must be tf32 on this machine.*its gradients differ"):
                 require_update_parity(updates, episodes)
+
+
+def sliding(seed):
+    """A body that slides on a rough floor at constant speed, hardly deformed, as kernels and the check take it."""
+    generator = torch.Generator().manual_seed(seed)
+    size_3, low_3 = torch.tensor([[0.3, 0.04, 0.3], [0.2, 0.03, 0.2]])
+    place_N3 = torch.rand(1, 24, 3, generator=generator) * size_3 + low_3
+    angle, age_T11 = 2 * math.pi * torch.rand((), generator=generator), torch.arange(HISTORY + 4)[:, None, None]
+    shift_T13 = 3e-3 * age_T11 * torch.stack([angle.cos(), torch.zeros(()), angle.sin()])
+    position_TN3 = place_N3 + shift_T13 + 1e-5 * torch.randn(HISTORY + 4, 24, 3, generator=generator)
+    material_N, scene = torch.zeros(24, dtype=torch.int32), {"gravity": GRAVITY, "wall_friction": (0.7, 0.7, 0.7)}
+    made = DeviceEpisode(position_TN3.to(device()), material_N.to(device()), None, (1.0, 1.0, 1.0), **scene)
+    return made, EpisodeTensors(position_TN3, material_N, random_grid(0, 0), (1.0, 1.0, 1.0), **scene)
+
+
+def test_friction_that_rounding_switches(monkeypatch):
+    """Rounding to 11 bits decides on which side of a jump the gradient of friction is: right kernels pass. A backward
+    pass without the derivatives of friction, or without any one direction of edges, is refused."""
+    changes = {"inputs": "local", "own_physics": ("friction",), "obstacle_features": False}
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.07, **changes)
+    with torch.no_grad():
+        network.decode.second.weight.mul_(0.1)
+        network.decode.second.bias.mul_(0.1)
+    made, episodes = zip(sliding(1300), sliding(1301), strict=True)
+    updates = updates_of(network, 2, (256,), precision="fp16")
+
+    def errors(damage):
+        updates.predict([(each, 0, 1) for each in made])
+        backward = updates.fused.backward
+        with monkeypatch.context() as patch:
+            patch.setattr(updates.fused, "backward", lambda: (damage(updates.fused.grid), backward()))
+            return require_update_parity(updates, episodes)
+
+    assert max(errors(lambda _: None)) < 0.1
+    faults = [lambda grid: grid.friction_fraction_C[:, 4:].zero_()]
+    faults += [lambda grid, i=direction: grid.neighbour(0)[i].fill_(-1) for direction in range(6)]
+    for fault in faults:
+        with pytest.raises(ConfigError, match="its gradients differ"):
+            errors(fault)
