@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.triton_compat import settle_keys
-from hgn.network.relative import POINT, THIN
+from hgn.network.centres import POINT, THIN
 
 THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # limits of a cell's contents for a known rotation
 
@@ -32,7 +32,7 @@ def adjugate(matrix, x, y, z):
 
 @triton.jit
 def rotation(inertia, x, y, z):
-    """Returns how well moments about a centre determine a rotation, and its rate (hgn.network.relative.rotation).
+    """Returns how well moments about a centre determine a rotation, and its rate (hgn.network.centres.rotation).
 
     The inertia is in the order xx, yy, zz, yz, xz, xy.
     """

@@ -8,7 +8,7 @@ With `bodies`, cells of different bodies are different cells, on all levels. A b
 particles connect: a particle connects its eight cells. So a coarser cell belongs to one body, and a cube of space may
 have several cells. Edges join cells of the same body, on coarser levels only where an edge of the finest level crosses
 their common face. So bodies that are apart exchange nothing.
-Shape legend: N particles, C cells of a level, E directed edges of a level, S scenes.
+Shape legend: N particles, G groups of particles, C cells of a level, E directed edges of a level, S scenes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import torch
 from torch.compiler import is_exporting
 
 from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unique, unpack
+from hgn.network.centres import Centres
 from hgn.schema import ConfigError
 
 # The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
@@ -52,38 +53,32 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class GridHierarchy:
-    """All levels, finest first, and the 8 cells of each particle."""
+    """All levels, finest first, and the 8 cells of each particle. Particles with the same cells form a group."""
 
     levels: tuple[Level, ...]
     cell_N8: torch.Tensor  # int64, index into the finest level; corner order of CORNER_83
+    cell_G8: torch.Tensor  # the same for each group
+    group_N: torch.Tensor  # int64
     weight_N8: torch.Tensor  # trilinear, sums to 1; some are zero if the particle lies on a plane of cell centres
     fraction_N3: torch.Tensor  # particle minus the centre of its first corner's cell, in cells, [0, 1)
 
     @cached_property
-    def coarsest_cells(self) -> torch.Tensor:
-        """Returns the coarsest ancestors of each particle's eight cells, [N, 8]. Some may be equal."""
-        cell_N8 = self.cell_N8
-        for level in self.levels[:-1]:
-            assert level.parent_C is not None
-            cell_N8 = level.parent_C[cell_N8]
-        return cell_N8
-
-    def coarsest_sums(self, value_NK: torch.Tensor) -> torch.Tensor:
-        """Returns sums [C, K] of w_pC times the particles' values in the coarsest cells."""
-        value_N8K = self.weight_N8[..., None] * value_NK[:, None]
-        sum_CK = value_NK.new_zeros(self.levels[-1].cell_count, value_NK.shape[1])
-        return sum_CK.index_add(0, self.coarsest_cells.flatten(), value_N8K.flatten(0, 1))
+    def finest(self) -> Centres:
+        """Returns the centres of the finest cells."""
+        offset_183 = -CORNER_83.to(self.fraction_N3)[None]
+        count = self.levels[0].cell_count
+        return Centres(self.weight_N8, self.fraction_N3, self.group_N, self.cell_G8, offset_183, count)
 
     @cached_property
-    def coarsest_places(self) -> torch.Tensor:
-        """Returns the particles' positions relative to the centres of `coarsest_cells`, in cell edges, [N, 8, 3]."""
-        corner_83 = CORNER_83.to(self.fraction_N3)
-        place_N83, cell_N8 = self.fraction_N3[:, None] - corner_83, self.cell_N8
+    def coarsest(self) -> Centres:
+        """Returns the centres of the coarsest ancestors of each particle's eight cells, some of which may be equal."""
+        corner_83, cell_G8 = CORNER_83.to(self.fraction_N3), self.cell_G8
+        place_N3, offset_G83 = self.fraction_N3, -corner_83[None]
         for level in self.levels[:-1]:
             assert level.parent_C is not None and level.octant_C is not None
-            place_N83 = 0.5 * (place_N83 + corner_83[level.octant_C[cell_N8]] - 0.5)
-            cell_N8 = level.parent_C[cell_N8]
-        return place_N83
+            place_N3, offset_G83 = 0.5 * place_N3, 0.5 * (offset_G83 + corner_83[level.octant_C[cell_G8]] - 0.5)
+            cell_G8 = level.parent_C[cell_G8]
+        return Centres(self.weight_N8, place_N3, self.group_N, cell_G8, offset_G83, self.levels[-1].cell_count)
 
 
 def build_hierarchy(
@@ -110,15 +105,17 @@ def build_hierarchy(
     base_N3 = torch.floor(grid_N3)
     fraction_N3 = grid_N3 - base_N3
     corner_83 = CORNER_83.to(position_N3.device)
-    weight_N8 = torch.where(corner_83.bool(), fraction_N3[:, None], 1 - fraction_N3[:, None]).prod(-1)
     # A particle exactly on a plane of centres gives the far corners no weight, so these must not become active.
     # Their entries point at the near corner instead, with weight zero.
-    reached_N83 = corner_83 * (fraction_N3 > 0)[:, None].long()
-    key_N8 = pack(scene_N[:, None], base_N3.long()[:, None] + reached_N83)
-    key_C, cell_N8 = unique(key_N8)
+    reached_N = octant(fraction_N3 > 0)
+    key_B, base_N = unique(pack(scene_N, base_N3.long()))
+    key_G, group_N = unique(8 * base_N + reached_N)
+    scene_G, coordinate_G3 = unpack(key_B[key_G >> 3])
+    coordinate_G83 = coordinate_G3[:, None] + corner_83 * corner_83[key_G & 7][:, None]
+    key_C, cell_G8 = unique(pack(scene_G[:, None], coordinate_G83))
 
     finest_count = key_C.shape[0]
-    body_C = _bodies(cell_N8, finest_count) if bodies else None
+    body_C = _bodies(cell_G8, finest_count) if bodies else None
     built: list[Level] = []
     for level in range(levels):
         edges = _edges_of_parents(built[-1], key_C.shape[0]) if bodies and level > 0 else _edges(key_C, body_C)
@@ -132,27 +129,33 @@ def build_hierarchy(
             owned, parent_C = unique(parent_C * finest_count + body_C)
             parent = torch.div(owned, finest_count, rounding_mode="floor")
             parent_key, body_C = parent_key[parent], owned - finest_count * parent  # ONNX has no % by a size
-        octant_C = ((coordinate_C3 & 1) * torch.tensor([4, 2, 1], device=key_C.device)).sum(-1)
-        built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant_C))
+        built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant(coordinate_C3 & 1)))
         key_C = parent_key
-    return GridHierarchy(tuple(built), cell_N8, weight_N8, fraction_N3)
+    return GridHierarchy(tuple(built), cell_G8[group_N], cell_G8, group_N, trilinear(fraction_N3), fraction_N3)
 
 
-def _bodies(cell_N8: torch.Tensor, count: int) -> torch.Tensor:
+def trilinear(fraction_N3: torch.Tensor) -> torch.Tensor:
+    """Returns the weights of the corners of a cube at positions in it, [N, 8]."""
+    x_N2, y_N2, z_N2 = torch.stack([1 - fraction_N3, fraction_N3], -1).unbind(1)
+    return (x_N2[:, :, None, None] * y_N2[:, None, :, None] * z_N2[:, None, None]).flatten(1)
+
+
+def octant(upper_K3: torch.Tensor) -> torch.Tensor:
+    """Returns the row of CORNER_83 of each triple of zeros and ones, int64 [K]."""
+    return (upper_K3 * torch.tensor([4, 2, 1], device=upper_K3.device)).sum(-1)
+
+
+def _bodies(cell_G8: torch.Tensor, count: int) -> torch.Tensor:
     """Returns the body of each finest cell, int64 [C]: its lowest cell.
 
     In each round a cell, and the cell that it links to, get the lowest link among the cells that share a particle with
     them. Then links are followed once (as in Zhang, Azad and Hu 2020). An exported graph has a fixed number of rounds.
     """
-    # The cells of all particles whose first cell is this one. An entry without a particle is the cell itself.
-    own_C = torch.arange(count, device=cell_N8.device)
-    cell_C8 = own_C[:, None].repeat(1, 8)
-    cell_C8 = cell_C8.scatter_reduce(0, cell_N8[:, :1].expand(-1, 8), cell_N8, "amax")
-    body_C, rounds = own_C, 0
+    body_C, rounds = torch.arange(count, device=cell_G8.device), 0
     while True:
-        least_C8 = body_C[cell_C8].amin(1, keepdim=True).expand(-1, 8).flatten()
-        linked_C = body_C.scatter_reduce(0, body_C[cell_C8].flatten(), least_C8, "amin")
-        linked_C = linked_C.scatter_reduce(0, cell_C8.flatten(), least_C8, "amin")
+        least_G8 = body_C[cell_G8].amin(1, keepdim=True).expand(-1, 8).flatten()
+        linked_C = body_C.scatter_reduce(0, body_C[cell_G8].flatten(), least_G8, "amin")
+        linked_C = linked_C.scatter_reduce(0, cell_G8.flatten(), least_G8, "amin")
         linked_C, rounds = linked_C[linked_C], rounds + 1
         if rounds == EXPORTED_ROUNDS if is_exporting() else torch.equal(linked_C, body_C):
             return linked_C

@@ -226,10 +226,10 @@ def surface_velocity(
     t is the particle's contact, `touch_N`. V_own is its row of `surface_N3`, 0 at walls. V_mean is the mean of V_own,
     weighted by t, over the particles in the same coarsest cells and in their face neighbours.
     """
-    level, weight_N8 = grid.levels[-1], grid.weight_N8
-    sum_C4 = grid.coarsest_sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))
+    level, gate_C1 = grid.levels[-1], touched_C[:, None]
+    sum_C4 = grid.coarsest.sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))
     sum_C4 = sum_C4.index_add(0, level.receiver_E, sum_C4[level.sender_E])
     mean_C3 = sum_C4[:, :3] / sum_C4[:, 3:].clamp(min=TINY)
-    weight_N8 = weight_N8 * touched_C[grid.coarsest_cells]
-    near_N3 = (weight_N8[..., None] * mean_C3[grid.coarsest_cells]).sum(1) / weight_N8.sum(1)[:, None].clamp(min=TINY)
+    near_N3, gate_N1 = grid.coarsest.at_particles(torch.cat([gate_C1 * mean_C3, gate_C1], -1)).split([3, 1], 1)
+    near_N3 = near_N3 / gate_N1.clamp(min=TINY)
     return touch_N[:, None] * surface_N3 + (1 - touch_N)[:, None] * near_N3

@@ -159,7 +159,7 @@ def surface_friction(
     next_N3 = (velocity_N3 + state.gravity_S3[state.scene_N]) / scale
     square_N1 = next_N3.square().sum(-1, keepdim=True)
     value_NK = torch.cat([rough_N33.flatten(1), near_N6, next_N3, square_N1, torch.ones_like(square_N1)], dim=-1)
-    sum_CK = grid.coarsest_sums(value_NK)
+    sum_CK = grid.coarsest.sums(value_NK)
     mean_C4 = sum_CK[:, 15:19] / sum_CK[:, 19:].clamp(min=TINY)
     variance_C = (mean_C4[:, 3] - mean_C4[:, :3].square().sum(-1)).clamp(min=0)
     obstacle_C33, wall_C6 = sum_CK[:, :9].unflatten(1, (3, 3)), sum_CK[:, 9:15]

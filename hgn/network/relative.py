@@ -31,6 +31,7 @@ from dataclasses import dataclass
 import torch
 
 from hgn.config import NetworkConfig
+from hgn.network.centres import SMALLEST_MASS, adjugate, inertia, rotation, trace
 from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.moving import surface_velocity
@@ -43,13 +44,8 @@ STEPS_AHEAD = 4  # number of positions on the path of the next frame that are se
 QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units of s_a; rounding gives 1e-5 to 1e-4
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
-SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight gets velocity 0
 # A surface's effect on a cell fades if its weight in P (see `slip`) is less than FEW, or than RARE times P's trace.
 FEW, RARE = 0.1, 1e-3
-# Particles on a line define no rotation about it. So a rotation fades out if the product of the three principal moments
-# is below (THIN * mean moment)^3, or if the mean moment is below POINT. Moments: in squared edges of a coarsest cell.
-THIN = 0.2
-POINT = 1e-3  # moment of a cube with 1/13 of the edge of a coarsest cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +93,8 @@ def relative_features(
     if has_friction(state) and "friction" in config.own_physics:
         friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale, local=local)
     contacts = Contacts(disturbed_C, touched_C, normal_C33, friction)
-    gate_N = (grid.weight_N8 * touched_C[grid.coarsest_cells]).sum(1)
-    parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
+    gate_N1 = grid.coarsest.at_particles(touched_C[:, None])
+    parts = [motion_NK, gate_N1 * torch.asinh(velocity_N3 / scale), wall_N6]
     return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 
 
@@ -113,19 +109,15 @@ def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor
     A cell's velocity is sum(w v) / sum(w) with the trilinear weights w of its particles; coarser levels add the sums of
     the children. A particle's mean on a level is that of the ancestors of its eight finest cells, with the same w.
     """
-    weight_N8 = grid.weight_N8
-    value_N84 = weight_N8[..., None] * torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1)[:, None]
-    momentum_C4 = value_N84.new_zeros(grid.levels[0].cell_count, 4)
-    momentum_C4.index_add_(0, grid.cell_N8.flatten(), value_N84.flatten(0, 1))
-    cell_N8, columns = grid.cell_N8, []
+    momentum_C4 = grid.finest.sums(torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1))
+    ancestor_C, columns = torch.arange(momentum_C4.shape[0], device=velocity_N3.device), []
     for i, level in enumerate(grid.levels):
-        mean_C3 = momentum_C4[:, :3] / momentum_C4[:, 3:].clamp(min=SMALLEST_MASS)
-        columns.append(velocity_N3 - (weight_N8[..., None] * mean_C3[cell_N8]).sum(1))
+        columns.append((momentum_C4[:, :3] / momentum_C4[:, 3:].clamp(min=SMALLEST_MASS))[ancestor_C])
         if level.parent_C is not None:
             coarse_C4 = momentum_C4.new_zeros(grid.levels[i + 1].cell_count, 4)
             momentum_C4 = coarse_C4.index_add_(0, level.parent_C, momentum_C4)
-            cell_N8 = level.parent_C[cell_N8]
-    return torch.cat(columns, dim=-1)
+            ancestor_C = level.parent_C[ancestor_C]
+    return velocity_N3.repeat(1, len(columns)) - grid.finest.at_particles(torch.cat(columns, dim=-1))
 
 
 def wall_nearness(
@@ -188,7 +180,7 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, local
 
 def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
     """Returns P [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
-    return grid.coarsest_sums(normal_N33.flatten(1)).unflatten(1, (3, 3))
+    return grid.coarsest.sums(normal_N33.flatten(1)).unflatten(1, (3, 3))
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:
@@ -202,17 +194,6 @@ def slip(normal_C33: torch.Tensor) -> torch.Tensor:
     return adjugate_C33 / determinant_C[:, None, None]
 
 
-def trace(matrix_K33: torch.Tensor) -> torch.Tensor:
-    return matrix_K33.diagonal(dim1=-2, dim2=-1).sum(-1)
-
-
-def adjugate(matrix_K33: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns determinants [K] and adjugates [K, 3, 3] of symmetric matrices."""
-    row = matrix_K33.unbind(1)
-    adjugate_K33 = torch.stack([torch.linalg.cross(row[i - 2], row[i - 1]) for i in range(3)], 1)
-    return (row[0] * adjugate_K33[:, 0]).sum(-1), adjugate_K33
-
-
 def disturbance(
     motion_NK: torch.Tensor, touch_N: torch.Tensor, grid: GridHierarchy
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -224,7 +205,7 @@ def disturbance(
     count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
-    cell_N8, coarsest = grid.coarsest_cells, grid.levels[-1]
+    cell_N8, coarsest = grid.coarsest.cells, grid.levels[-1]
 
     def felt(value_N: torch.Tensor) -> torch.Tensor:
         own_C, value_N8 = value_N.new_zeros(coarsest.cell_count), torch.where(grid.weight_N8 > 0, value_N[:, None], 0)
@@ -260,25 +241,16 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     is along their normals, for any parameters. Friction keeps a part of Q_C R_C (`own_physics.friction_fraction`).
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
-    level, cell_N8, weight_N8 = grid.levels[-1], grid.coarsest_cells, grid.weight_N8
-    place_N83 = grid.coarsest_places
-    moment_N83 = torch.linalg.cross(place_N83, output_N9[:, None, :3].expand_as(place_N83))
-    square_N89 = (place_N83[..., :, None] * place_N83[..., None, :]).flatten(2)
-    value_N8K = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)[:, None].expand(-1, 8, -1)
-    value_N8K = weight_N8[..., None] * torch.cat([moment_N83, place_N83, square_N89, value_N8K], dim=-1)
-    sum_CK = value_N8K.new_zeros(level.cell_count, value_N8K.shape[-1])
-    sum_CK = sum_CK.index_add(0, cell_N8.flatten(), value_N8K.flatten(0, 1))
-    mass_C = sum_CK[:, -1].clamp(min=SMALLEST_MASS)
-    mean_CK = sum_CK / mass_C[:, None]
-    mean_C3, stress_C33 = mean_CK[:, -10:-7], mean_CK[:, torch.tensor(STRESS_33, device=mean_CK.device) - 10]
+    level, coarsest = grid.levels[-1], grid.coarsest
+    mass_C1, centre_C3, inertia_C33 = coarsest.bodies
+    mean_C3, known_C, turn_C3 = coarsest.motion(output_N9[:, :3])
+    stress_C6, mass_C = coarsest.sums(output_N9[:, 3:]) / mass_C1, mass_C1[:, 0]
+    stress_C33 = stress_C6[:, torch.tensor(STRESS_33, device=stress_C6.device) - 3]
     sender_E, receiver_E = level.sender_E, level.receiver_E
-    towards_E3 = DIRECTION_63.to(mean_CK)[level.direction_E]
+    towards_E3 = DIRECTION_63.to(mean_C3)[level.direction_E]
     traction_E3 = ((stress_C33[receiver_E] + stress_C33[sender_E]) @ towards_E3[..., None]).squeeze(-1)
     share_E = 0.5 * disturbed_C[sender_E] * mass_C[sender_E] / (mass_C[sender_E] + mass_C[receiver_E])
-    free_C, centre_C3 = 1 - touched_C, mean_CK[:, 3:6]
-    spread_C33 = mean_CK[:, 6:15].unflatten(1, (3, 3)) - centre_C3[:, :, None] * centre_C3[:, None, :]
-    inertia_C33 = inertia(spread_C33)
-    known_C, turn_C3 = rotation(inertia_C33, mean_CK[:, :3] - torch.linalg.cross(centre_C3, mean_C3))
+    free_C = 1 - touched_C
     own_C = disturbed_C * (touched_C + free_C * known_C)
     apart_E3 = towards_E3 + centre_C3[sender_E] - centre_C3[receiver_E]
     part_E = mass_C[receiver_E] / (mass_C[sender_E] + mass_C[receiver_E])
@@ -303,25 +275,5 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     felt_E = 0.5 * disturbed_C[sender_E]
     turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)
     turn_C3 = disturbed_C[:, None] * turn_C3
-    own_N3 = (weight_N8 * own_C[cell_N8]).sum(1)[:, None] * output_N9[:, :3]
-    change_N83 = change_C3[cell_N8] - torch.linalg.cross(turn_C3[cell_N8], place_N83 - centre_C3[cell_N8])
-    return own_N3 + (weight_N8[..., None] * change_N83).sum(1)
-
-
-def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
-    """Returns tr(G) - G of the second moments G [K, 3, 3] of masses about their centre."""
-    one_33 = torch.eye(3, dtype=spread_K33.dtype, device=spread_K33.device)
-    return trace(spread_K33)[:, None, None] * one_33 - spread_K33
-
-
-def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns q [K], from 0 (a line or a point) to 1 (a determined rotation), and W [K, 3] with I W = q J.
-
-    q = det I / (det I + m) and W = adj(I) J / (det I + m), with m = (THIN (tr I / 3 + POINT))^3. The denominator is
-    positive, so q and W do not jump. If a field u has the angular momentum J, the field q u - W x y has none.
-    """
-    determinant_K, adjugate_K33 = adjugate(inertia_K33)
-    determinant_K = determinant_K.clamp(min=0)
-    mean_K = trace(inertia_K33) / 3
-    total_K = determinant_K + (THIN * (mean_K + POINT)) ** 3
-    return determinant_K / total_K, (adjugate_K33 @ moment_K3[..., None]).squeeze(-1) / total_K[:, None]
+    own_N1, change_N3 = coarsest.field(own_C, change_C3, turn_C3)
+    return own_N1 * output_N9[:, :3] + change_N3

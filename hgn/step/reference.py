@@ -29,9 +29,9 @@ from torch.compiler import is_exporting
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack, unique, unpack
+from hgn.network.centres import Centres
 from hgn.network.features import ParticleState
-from hgn.network.grid import CORNER_83, GridHierarchy
-from hgn.network.relative import SMALLEST_MASS, inertia, rotation
+from hgn.network.grid import CORNER_83, GridHierarchy, trilinear
 from hgn.step_config import StepConfig
 
 SURE = 0.5  # smallest q at which rotation is removed in full
@@ -150,44 +150,30 @@ class Deformation:
     def __init__(
         self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, share_N: torch.Tensor | None = None
     ) -> None:
-        cell_N8, corner_83 = grid.coarsest_cells, CORNER_83.to(grid.cell_N8)
-        gate_N = (grid.weight_N8 * touched_C[cell_N8]).sum(1)
+        coarsest, corner_83 = grid.coarsest, CORNER_83.to(grid.group_N.device)
+        gate_N1 = coarsest.at_particles(touched_C[:, None])
         if share_N is not None:
-            gate_N = share_N * gate_N
-        scene_N, coordinate_N3 = unpack(grid.levels[-1].key_C[cell_N8[:, 0]])
-        place_N3 = grid.coarsest_places[:, 0]
+            gate_N1 = share_N[:, None] * gate_N1
+        first_G = coarsest.centre_G8[:, 0]
+        scene_N, coordinate_N3 = (x[first_G[grid.group_N]] for x in unpack(grid.levels[-1].key_C))
+        place_N3 = coarsest.place_N3 + coarsest.offset_G83[:, 0].expand(first_G.shape[0], 3)[grid.group_N]
         low_N3 = torch.floor(place_N3)
         low_N3, place_N3 = coordinate_N3 + low_N3.long(), place_N3 - low_N3
         wide_N3 = low_N3 >> shift
-        key_N8 = pack(scene_N[:, None], wide_N3[:, None] + corner_83)
-        key_K, self.middle_N8 = unique(key_N8)
-        self.count = key_K.shape[0]
-        self.place_N83 = ((low_N3 - (wide_N3 << shift) + place_N3) / 2**shift)[:, None] - corner_83
-        self.weight_N8 = gate_N[:, None] * (1 - self.place_N83.abs()).prod(-1)
-        square_N89 = (self.place_N83[..., :, None] * self.place_N83[..., None, :]).flatten(2)
-        sum_KX = self._sums(torch.cat([torch.ones_like(square_N89[..., :1]), self.place_N83, square_N89], -1))
-        self.mass_K1 = sum_KX[:, :1].clamp(min=SMALLEST_MASS)
-        self.centre_K3, square_K9 = (sum_KX[:, 1:] / self.mass_K1).split([3, 9], 1)
-        spread_K33 = square_K9.unflatten(1, (3, 3)) - self.centre_K3[:, :, None] * self.centre_K3[:, None, :]
-        self.inertia_K33 = inertia(spread_K33)
+        place_N3 = (low_N3 - (wide_N3 << shift) + place_N3) / 2**shift
+        key_G, group_N = unique(pack(scene_N, wide_N3))
+        scene_G, wide_G3 = unpack(key_G)
+        key_K, centre_G8 = unique(pack(scene_G[:, None], wide_G3[:, None] + corner_83))
+        weight_N8 = gate_N1 * trilinear(place_N3)
+        offset_183 = -corner_83.to(place_N3)[None]
+        self.centres = Centres(weight_N8, place_N3, group_N, centre_G8, offset_183, key_K.shape[0])
 
     def __call__(self, value_N3: torch.Tensor) -> torch.Tensor:
-        value_N83 = value_N3[:, None].expand_as(self.place_N83)
-        sum_K6 = self._sums(torch.cat([value_N83, torch.linalg.cross(self.place_N83, value_N83)], -1))
-        mean_K3, moment_K3 = (sum_K6 / self.mass_K1).split(3, 1)
-        known_K, turn_K3 = rotation(self.inertia_K33, moment_K3 - torch.linalg.cross(self.centre_K3, mean_K3))
+        mean_K3, known_K, turn_K3 = self.centres.motion(value_N3)
         share_K = 1 / known_K.clamp(min=SURE)
-        factor_N81 = (share_K * known_K)[self.middle_N8][..., None]
-        turn_N83 = (share_K[:, None] * turn_K3)[self.middle_N8]
-        place_N83 = self.place_N83 - self.centre_K3[self.middle_N8]
-        part_N83 = factor_N81 * (value_N83 - mean_K3[self.middle_N8]) - torch.linalg.cross(turn_N83, place_N83)
-        return (self.weight_N8[..., None] * part_N83).sum(1)
-
-    def _sums(self, value_N8X: torch.Tensor) -> torch.Tensor:
-        """Returns weighted sums over the particles of each centre, [K, X]."""
-        value_N8X = self.weight_N8[..., None] * value_N8X
-        sum_KX = value_N8X.new_zeros(self.count, value_N8X.shape[-1])
-        return sum_KX.index_add(0, self.middle_N8.flatten(), value_N8X.flatten(0, 1))
+        factor_K = share_K * known_K
+        factor_N1, field_N3 = self.centres.field(factor_K, -factor_K[:, None] * mean_K3, share_K[:, None] * turn_K3)
+        return factor_N1 * value_N3 + field_N3
 
 
 def rest(
