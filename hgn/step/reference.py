@@ -234,22 +234,25 @@ def _outside_obstacles(
     Each triangle shifts the end along its normal. If that normal points back across the plane of the previous shift,
     the end moves along that plane instead. Otherwise a path in a groove would alternate between the two planes.
     """
-    before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
-    lost_N1 = ~within_range(position_N3, domain_N3).all(-1, keepdim=True)
-    end_N3 = torch.where(lost_N1, before_N3, position_N3)
-    last_N3 = torch.zeros_like(end_N3)
+    lost_N1 = ~within_range(position_N3, state.domain_S3[state.scene_N]).all(-1, keepdim=True)
+    end_N3 = torch.where(lost_N1, state.position_N3, position_N3)
+    row_K, last_K3 = torch.arange(end_N3.shape[0], device=end_N3.device), torch.zeros_like(end_N3)
     for surface in range(SURFACES + 1):
-        hit_N, shift_N1, normal_N3, free_N1 = first_stop(barriers, before_N3, end_N3, state.scene_N)
-        if not is_exporting() and not bool(hit_N.any()):
-            break
+        before_K3, scene_K, end_K3 = state.position_N3[row_K], state.scene_N[row_K], end_N3[row_K]
+        hit_K, shift_K1, normal_K3, free_K1 = first_stop(barriers, before_K3, end_K3, scene_K)
         if surface == SURFACES:
-            moved_N3 = before_N3 + free_N1 * (end_N3 - before_N3)
+            moved_K3 = before_K3 + free_K1 * (end_K3 - before_K3)
         else:
-            moved_N3 = end_N3 + shift_N1 * _direction(normal_N3, last_N3)
+            moved_K3 = end_K3 + shift_K1 * _direction(normal_K3, last_K3)
             if step.wall_clearance is not None:
-                moved_N3 = _walled(state, moved_N3, step.wall_clearance, dimensions)
-        end_N3 = torch.where(hit_N[:, None], moved_N3, end_N3)
-        last_N3 = torch.where(hit_N[:, None], normal_N3, last_N3)
+                own = replace(state, position_N3=before_K3, scene_N=scene_K)
+                moved_K3 = _walled(own, moved_K3, step.wall_clearance, dimensions)
+        end_N3 = end_N3.index_put((row_K,), torch.where(hit_K[:, None], moved_K3, end_K3))
+        last_K3 = torch.where(hit_K[:, None], normal_K3, last_K3)
+        if not is_exporting():  # only a path that stops can stop again
+            row_K, last_K3 = row_K[hit_K], last_K3[hit_K]
+            if not len(row_K):
+                break
     return torch.where(lost_N1, position_N3, end_N3)
 
 
@@ -297,13 +300,9 @@ def first_stop(
         hit_N, shift_N1, normal_N3, free_N1 = map(torch.cat, zip(*stops, strict=True))
         return hit_N, shift_N1, normal_N3, free_N1
     particle_P, triangle_P = candidates
-    row_P24 = barriers.row_F24.to(before_N3.dtype)[triangle_P]
-    before_P3, way_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P]
-    normal_P3 = row_P24[:, :3]
-    distance_P = (normal_P3 * before_P3).sum(-1) - row_P24[:, 3]
-    side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
-    distance_P = side_P * distance_P
-    approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
+    row_P24 = barriers.row_F24[triangle_P].to(before_N3.dtype)
+    before_P3, way_P3, normal_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P], row_P24[:, :3]
+    side_P, distance_P, approach_P = _approach(row_P24, before_P3, way_P3)
     end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
     within, slack = (1 - SLACK) * barriers.clearance, SLACK * barriers.clearance
     contact_P = ((distance_P - within) / closing_P).clamp(0, 1)
@@ -358,7 +357,23 @@ def _pairs(
         return None
     shift_P = torch.repeat_interleave(start_L - count_L.cumsum(0) + count_L, count_L, output_size=count)
     entry_P = torch.arange(count, device=scene_N.device) + shift_P
-    return torch.repeat_interleave(particle_L, count_L, output_size=count), barriers.triangle_E[entry_P]
+    particle_P, triangle_P = (
+        torch.repeat_interleave(particle_L, count_L, output_size=count),
+        barriers.triangle_E[entry_P],
+    )
+    row_P4 = barriers.row_F24[:, :4][triangle_P].to(before_N3.dtype)
+    _, distance_P, approach_P = _approach(row_P4, before_N3[particle_P], way_N3[particle_P])
+    (near_P,) = torch.nonzero((approach_P > 0) & (distance_P - approach_P < barriers.clearance), as_tuple=True)
+    return particle_P[near_P], triangle_P[near_P]
+
+
+def _approach(
+    row_PX: torch.Tensor, before_P3: torch.Tensor, way_P3: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns the side of a triangle's plane, 1 or -1, the distance from it, and the decrease along the path, [P]."""
+    distance_P = (row_PX[:, :3] * before_P3).sum(-1) - row_PX[:, 3]
+    side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
+    return side_P, side_P * distance_P, -side_P * (row_PX[:, :3] * way_P3).sum(-1)
 
 
 def pairs_of_boxes(
