@@ -20,35 +20,76 @@ POINT = 1e-3  # moment of a cube with 1/13 of the edge of a coarsest cell
 
 
 @dataclass(frozen=True, eq=False)
+class Groups:
+    """Particles in groups, each with the weights of its eight centres. On a CPU bags of rows take a tenth of the time
+    of products and `index_add`; an exported graph cannot contain them, and CUDA graphs not their gradients."""
+
+    weight_N8: torch.Tensor
+    group_N: torch.Tensor
+    count: int
+
+    def sums(self, value_NK: torch.Tensor) -> torch.Tensor:
+        """Returns sums [G, 8, K] of the particles' values times their weights."""
+        if not self._in_bags:
+            value_NX = (self.weight_N8[..., None] * value_NK[:, None]).flatten(1)
+            sum_GX = value_NX.new_zeros(self.count, value_NX.shape[1]).index_add(0, self.group_N, value_NX)
+            return sum_GX.unflatten(1, (8, -1))
+        return _bags(value_NK, *self._members).unflatten(0, (8, -1)).transpose(0, 1)
+
+    def at_particles(self, value_G8K: torch.Tensor) -> torch.Tensor:
+        """Returns sums [N, K] of the centres' values times the particles' weights."""
+        if not self._in_bags:
+            return (self.weight_N8[..., None] * value_G8K[self.group_N]).sum(1)
+        return _bags(value_G8K.flatten(0, 1), *self._centres)
+
+    @property
+    def _in_bags(self) -> bool:
+        return self.weight_N8.device.type == "cpu" and not is_exporting()
+
+    @cached_property
+    def _members(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns each group's particles, once for each of its centres: their numbers, starts of groups, weights."""
+        group_N, order_N = torch.sort(self.group_N, stable=True)
+        start_G = torch.searchsorted(group_N, torch.arange(self.count))
+        start_8G = len(group_N) * torch.arange(8)[:, None] + start_G
+        return order_N.repeat(8), start_8G.flatten(), self.weight_N8[order_N].T.flatten()
+
+    @cached_property
+    def _centres(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns each particle's rows of `value_G8K.flatten(0, 1)`: their numbers, starts of particles, weights."""
+        row_N8 = 8 * self.group_N[:, None] + torch.arange(8)
+        return row_N8.flatten(), torch.arange(0, row_N8.numel(), 8), self.weight_N8.flatten()
+
+
+def _bags(table: torch.Tensor, row: torch.Tensor, start: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Returns the weighted sums of the rows of each bag."""
+    return functional.embedding_bag(row, table, start, mode="sum", per_sample_weights=weight)
+
+
+@dataclass(frozen=True, eq=False)
 class Centres:
     """The eight centres around each particle. Lengths are in cell edges."""
 
-    weight_N8: torch.Tensor
+    groups: Groups
     place_N3: torch.Tensor  # positions relative to the group's origin
-    group_N: torch.Tensor
     centre_G8: torch.Tensor  # numbers of the centres, int64
     offset_G83: torch.Tensor  # the group's origin relative to the centres; [1, 8, 3] if it is the same for all groups
     count: int
 
-    @property
-    def cells(self) -> torch.Tensor:
-        """Returns each particle's centres, [N, 8]."""
-        return self.centre_G8[self.group_N]
-
     def sums(self, value_NK: torch.Tensor) -> torch.Tensor:
         """Returns sums [C, K] of the particles' values times their weights."""
-        return self._total(self._grouped(value_NK))
+        return self._total(self.groups.sums(value_NK))
 
     def at_particles(self, value_CK: torch.Tensor) -> torch.Tensor:
         """Returns sums [N, K] of the centres' values times the particles' weights."""
-        return self._spread(value_CK[self.centre_G8])
+        return self.groups.at_particles(value_CK[self.centre_G8])
 
     @cached_property
     def bodies(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns masses [C, 1], centres of mass relative to the centres [C, 3], and inertia over mass [C, 3, 3]."""
         place_N3 = self.place_N3
         square_N9 = (place_N3[:, :, None] * place_N3[:, None, :]).flatten(1)
-        sum_G8K = self._grouped(torch.cat([torch.ones_like(place_N3[:, :1]), place_N3, square_N9], -1))
+        sum_G8K = self.groups.sums(torch.cat([torch.ones_like(place_N3[:, :1]), place_N3, square_N9], -1))
         mass_G81, place_G83, square_G89 = sum_G8K.split([1, 3, 9], -1)
         moved_G83 = place_G83 + self.offset_G83 * mass_G81
         mixed_G833 = self.offset_G83[..., :, None] * moved_G83[..., None, :]
@@ -61,7 +102,7 @@ class Centres:
 
     def motion(self, value_N3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns the means [C, 3] of vectors, and `rotation` of their moments about the centres of mass."""
-        sum_G86 = self._grouped(torch.cat([value_N3, torch.linalg.cross(self.place_N3, value_N3)], -1))
+        sum_G86 = self.groups.sums(torch.cat([value_N3, torch.linalg.cross(self.place_N3, value_N3)], -1))
         sum_G83, moment_G83 = sum_G86.split(3, -1)
         moment_G83 = moment_G83 + torch.linalg.cross(self.offset_G83.expand_as(sum_G83), sum_G83)
         mass_C1, centre_C3, inertia_C33 = self.bodies
@@ -76,29 +117,13 @@ class Centres:
         table_C7 = torch.cat([factor_C[:, None], turn_C3, shift_C3], -1)
         factor_G81, turn_G83, shift_G83 = table_C7[self.centre_G8].split([1, 3, 3], -1)
         shift_G83 = shift_G83 - torch.linalg.cross(turn_G83, self.offset_G83.expand_as(turn_G83))
-        sum_N7 = self._spread(torch.cat([factor_G81, turn_G83, shift_G83], -1))
+        sum_N7 = self.groups.at_particles(torch.cat([factor_G81, turn_G83, shift_G83], -1))
         factor_N1, turn_N3, shift_N3 = sum_N7.split([1, 3, 3], -1)
         return factor_N1, shift_N3 - torch.linalg.cross(turn_N3, self.place_N3)
-
-    def _grouped(self, value_NK: torch.Tensor) -> torch.Tensor:
-        value_NX = (self.weight_N8[..., None] * value_NK[:, None]).flatten(1)
-        sum_GX = value_NX.new_zeros(self.centre_G8.shape[0], value_NX.shape[1]).index_add(0, self.group_N, value_NX)
-        return sum_GX.unflatten(1, (8, -1))
 
     def _total(self, value_G8K: torch.Tensor) -> torch.Tensor:
         sum_CK = value_G8K.new_zeros(self.count, value_G8K.shape[-1])
         return sum_CK.index_add(0, self.centre_G8.flatten(), value_G8K.flatten(0, 1))
-
-    @cached_property
-    def _rows(self) -> torch.Tensor:
-        """Returns the rows of `value_G8K.flatten(0, 1)` of each particle, [N, 8]."""
-        return 8 * self.group_N[:, None] + torch.arange(8, device=self.group_N.device)
-
-    def _spread(self, value_G8K: torch.Tensor) -> torch.Tensor:
-        if value_G8K.device.type != "cpu" or is_exporting():
-            return (self.weight_N8[..., None] * value_G8K[self.group_N]).sum(1)
-        table = value_G8K.flatten(0, 1)  # on a CPU a bag takes a sixteenth of the time
-        return functional.embedding_bag(self._rows, table, per_sample_weights=self.weight_N8, mode="sum")
 
 
 def trace(matrix_K33: torch.Tensor) -> torch.Tensor:

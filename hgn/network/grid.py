@@ -20,7 +20,7 @@ import torch
 from torch.compiler import is_exporting
 
 from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unique, unpack
-from hgn.network.centres import Centres
+from hgn.network.centres import Centres, Groups
 from hgn.schema import ConfigError
 
 # The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
@@ -57,17 +57,17 @@ class GridHierarchy:
 
     levels: tuple[Level, ...]
     cell_N8: torch.Tensor  # int64, index into the finest level; corner order of CORNER_83
-    cell_G8: torch.Tensor  # the same for each group
-    group_N: torch.Tensor  # int64
     weight_N8: torch.Tensor  # trilinear, sums to 1; some are zero if the particle lies on a plane of cell centres
     fraction_N3: torch.Tensor  # particle minus the centre of its first corner's cell, in cells, [0, 1)
+    cell_G8: torch.Tensor  # `cell_N8` of each group
+    groups: Groups
 
     @cached_property
     def finest(self) -> Centres:
         """Returns the centres of the finest cells."""
         offset_183 = -CORNER_83.to(self.fraction_N3)[None]
         count = self.levels[0].cell_count
-        return Centres(self.weight_N8, self.fraction_N3, self.group_N, self.cell_G8, offset_183, count)
+        return Centres(self.groups, self.fraction_N3, self.cell_G8, offset_183, count)
 
     @cached_property
     def coarsest(self) -> Centres:
@@ -78,7 +78,7 @@ class GridHierarchy:
             assert level.parent_C is not None and level.octant_C is not None
             place_N3, offset_G83 = 0.5 * place_N3, 0.5 * (offset_G83 + corner_83[level.octant_C[cell_G8]] - 0.5)
             cell_G8 = level.parent_C[cell_G8]
-        return Centres(self.weight_N8, place_N3, self.group_N, cell_G8, offset_G83, self.levels[-1].cell_count)
+        return Centres(self.groups, place_N3, cell_G8, offset_G83, self.levels[-1].cell_count)
 
 
 def build_hierarchy(
@@ -131,7 +131,9 @@ def build_hierarchy(
             parent_key, body_C = parent_key[parent], owned - finest_count * parent  # ONNX has no % by a size
         built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant(coordinate_C3 & 1)))
         key_C = parent_key
-    return GridHierarchy(tuple(built), cell_G8[group_N], cell_G8, group_N, trilinear(fraction_N3), fraction_N3)
+    weight_N8 = trilinear(fraction_N3)
+    groups = Groups(weight_N8, group_N, key_G.shape[0])
+    return GridHierarchy(tuple(built), cell_G8[group_N], weight_N8, fraction_N3, cell_G8, groups)
 
 
 def trilinear(fraction_N3: torch.Tensor) -> torch.Tensor:

@@ -142,12 +142,11 @@ def obstacle_surfaces(
     """
     if obstacles is None:
         return torch.zeros_like(position_N3).repeat(1, 2)
-    here_NV = obstacles.surfaces(position_N3, scene_N)
-    ahead_NV = torch.zeros_like(here_NV)
-    for step in range(STEPS_AHEAD, 0, -1):
-        surface_NV = obstacles.surfaces(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
-        ahead_NV = torch.where(surface_NV[:, :3].any(-1, keepdim=True), surface_NV, ahead_NV)
-    return torch.cat([here_NV, ahead_NV], dim=-1)
+    part_K11 = torch.arange(STEPS_AHEAD + 1, device=scene_N.device)[:, None, None] / STEPS_AHEAD
+    position_KN3 = position_N3 + velocity_N3 * part_K11.to(velocity_N3)
+    row_XV = obstacles.surfaces(position_KN3.flatten(0, 1), scene_N.repeat(STEPS_AHEAD + 1))
+    here_NV, *ahead = row_XV.unflatten(0, position_KN3.shape[:2]).unbind(0)
+    return torch.cat([here_NV, first_surface(ahead)], dim=-1)
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distance: bool) -> torch.Tensor:
@@ -205,11 +204,12 @@ def disturbance(
     count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
-    cell_N8, coarsest = grid.coarsest.cells, grid.levels[-1]
+    groups, cell_G8, coarsest = grid.groups, grid.coarsest.centre_G8, grid.levels[-1]
 
     def felt(value_N: torch.Tensor) -> torch.Tensor:
-        own_C, value_N8 = value_N.new_zeros(coarsest.cell_count), torch.where(grid.weight_N8 > 0, value_N[:, None], 0)
-        own_C.scatter_reduce_(0, cell_N8.flatten(), value_N8.flatten(), "amax")
+        own_G = value_N.new_zeros(groups.count).scatter_reduce(0, groups.group_N, value_N, "amax")
+        own_C, own_G8 = value_N.new_zeros(coarsest.cell_count), own_G[:, None].expand(-1, 8)
+        own_C = own_C.scatter_reduce(0, cell_G8.flatten(), own_G8.flatten(), "amax")
         return own_C.scatter_reduce(0, coarsest.receiver_E, own_C[coarsest.sender_E], "amax")
 
     return felt(own_N), felt(touch_N)

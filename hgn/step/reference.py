@@ -29,7 +29,7 @@ from torch.compiler import is_exporting
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack, unique, unpack
-from hgn.network.centres import Centres
+from hgn.network.centres import Centres, Groups
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, GridHierarchy, trilinear
 from hgn.step_config import StepConfig
@@ -150,13 +150,13 @@ class Deformation:
     def __init__(
         self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, share_N: torch.Tensor | None = None
     ) -> None:
-        coarsest, corner_83 = grid.coarsest, CORNER_83.to(grid.group_N.device)
+        coarsest, corner_83 = grid.coarsest, CORNER_83.to(touched_C.device)
         gate_N1 = coarsest.at_particles(touched_C[:, None])
         if share_N is not None:
             gate_N1 = share_N[:, None] * gate_N1
         first_G = coarsest.centre_G8[:, 0]
-        scene_N, coordinate_N3 = (x[first_G[grid.group_N]] for x in unpack(grid.levels[-1].key_C))
-        place_N3 = coarsest.place_N3 + coarsest.offset_G83[:, 0].expand(first_G.shape[0], 3)[grid.group_N]
+        scene_N, coordinate_N3 = (x[first_G[grid.groups.group_N]] for x in unpack(grid.levels[-1].key_C))
+        place_N3 = coarsest.place_N3 + coarsest.offset_G83[:, 0].expand(first_G.shape[0], 3)[grid.groups.group_N]
         low_N3 = torch.floor(place_N3)
         low_N3, place_N3 = coordinate_N3 + low_N3.long(), place_N3 - low_N3
         wide_N3 = low_N3 >> shift
@@ -164,9 +164,9 @@ class Deformation:
         key_G, group_N = unique(pack(scene_N, wide_N3))
         scene_G, wide_G3 = unpack(key_G)
         key_K, centre_G8 = unique(pack(scene_G[:, None], wide_G3[:, None] + corner_83))
-        weight_N8 = gate_N1 * trilinear(place_N3)
+        groups = Groups(gate_N1 * trilinear(place_N3), group_N, key_G.shape[0])
         offset_183 = -corner_83.to(place_N3)[None]
-        self.centres = Centres(weight_N8, place_N3, group_N, centre_G8, offset_183, key_K.shape[0])
+        self.centres = Centres(groups, place_N3, centre_G8, offset_183, key_K.shape[0])
 
     def __call__(self, value_N3: torch.Tensor) -> torch.Tensor:
         mean_K3, known_K, turn_K3 = self.centres.motion(value_N3)

@@ -55,7 +55,7 @@ def assert_features(network, state, found):
     # Cells that bodies divide have other numbers there.
     coarsest_N8 = found.engine.grid.coarsest_N8[: len(state.position_N3)].cpu().long()
     listed_N8 = coarsest_N8 >= 0
-    felt_C2, cell_K = found.engine.grid.felt_C2.cpu().double(), grid.coarsest.cells[listed_N8]
+    felt_C2, cell_K = found.engine.grid.felt_C2.cpu().double(), grid.coarsest.centre_G8[grid.groups.group_N][listed_N8]
     torch.testing.assert_close(felt_C2[coarsest_N8[listed_N8]], expected_C2[cell_K], rtol=0, atol=1e-3)
     assert len(cell_K.unique()) == len(expected_C2)
 

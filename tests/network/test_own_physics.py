@@ -62,7 +62,7 @@ def on_floor(friction=0.4, velocity=None, gravity=(0.0, -2.7e-3, 0.0), count=30,
 
 def mean_push(network, state):
     """The mean acceleration of the particles beyond gravity, in units of frames."""
-    assert len(torch.unique(network.grid(state).coarsest.cells)) == 1
+    assert len(torch.unique(network.grid(state).coarsest.centre_G8)) == 1
     return (network(state) - state.gravity_S3[state.scene_N]).detach().mean(0)
 
 
