@@ -34,13 +34,16 @@ class Groups:
             value_NX = (self.weight_N8[..., None] * value_NK[:, None]).flatten(1)
             sum_GX = value_NX.new_zeros(self.count, value_NX.shape[1]).index_add(0, self.group_N, value_NX)
             return sum_GX.unflatten(1, (8, -1))
-        return _bags(value_NK, *self._members).unflatten(0, (8, -1)).transpose(0, 1)
+        row, start, weight = self._members
+        sum_XK = functional.embedding_bag(row, value_NK, start, mode="sum", per_sample_weights=weight)
+        return sum_XK.unflatten(0, (8, -1)).transpose(0, 1)
 
     def at_particles(self, value_G8K: torch.Tensor) -> torch.Tensor:
         """Returns sums [N, K] of the centres' values times the particles' weights."""
         if not self._in_bags:
             return (self.weight_N8[..., None] * value_G8K[self.group_N]).sum(1)
-        return _bags(value_G8K.flatten(0, 1), *self._centres)
+        table_XK = value_G8K.flatten(0, 1)
+        return functional.embedding_bag(self._rows, table_XK, mode="sum", per_sample_weights=self.weight_N8)
 
     @property
     def _in_bags(self) -> bool:
@@ -55,15 +58,8 @@ class Groups:
         return order_N.repeat(8), start_8G.flatten(), self.weight_N8[order_N].T.flatten()
 
     @cached_property
-    def _centres(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Returns each particle's rows of `value_G8K.flatten(0, 1)`: their numbers, starts of particles, weights."""
-        row_N8 = 8 * self.group_N[:, None] + torch.arange(8)
-        return row_N8.flatten(), torch.arange(0, row_N8.numel(), 8), self.weight_N8.flatten()
-
-
-def _bags(table: torch.Tensor, row: torch.Tensor, start: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Returns the weighted sums of the rows of each bag."""
-    return functional.embedding_bag(row, table, start, mode="sum", per_sample_weights=weight)
+    def _rows(self) -> torch.Tensor:
+        return 8 * self.group_N[:, None] + torch.arange(8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -240,6 +240,8 @@ def _outside_obstacles(
     for surface in range(SURFACES + 1):
         before_K3, scene_K, end_K3 = state.position_N3[row_K], state.scene_N[row_K], end_N3[row_K]
         hit_K, shift_K1, normal_K3, free_K1 = first_stop(barriers, before_K3, end_K3, scene_K)
+        if not is_exporting() and not bool(hit_K.any()):
+            break
         if surface == SURFACES:
             moved_K3 = before_K3 + free_K1 * (end_K3 - before_K3)
         else:
@@ -251,8 +253,6 @@ def _outside_obstacles(
         last_K3 = torch.where(hit_K[:, None], normal_K3, last_K3)
         if not is_exporting():  # only a path that stops can stop again
             row_K, last_K3 = row_K[hit_K], last_K3[hit_K]
-            if not len(row_K):
-                break
     return torch.where(lost_N1, position_N3, end_N3)
 
 
@@ -300,11 +300,18 @@ def first_stop(
         hit_N, shift_N1, normal_N3, free_N1 = map(torch.cat, zip(*stops, strict=True))
         return hit_N, shift_N1, normal_N3, free_N1
     particle_P, triangle_P = candidates
-    row_P24 = barriers.row_F24[triangle_P].to(before_N3.dtype)
-    before_P3, way_P3, normal_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P], row_P24[:, :3]
-    side_P, distance_P, approach_P = _approach(row_P24, before_P3, way_P3)
-    end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
+    row_P4, way_N3 = barriers.row_F24[:, :4][triangle_P].to(before_N3.dtype), after_N3 - before_N3
+    distance_P = (row_P4[:, :3] * before_N3[particle_P]).sum(-1) - row_P4[:, 3]
+    side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
+    distance_P, approach_P = side_P * distance_P, -side_P * (row_P4[:, :3] * way_N3[particle_P]).sum(-1)
     within, slack = (1 - SLACK) * barriers.clearance, SLACK * barriers.clearance
+    if not is_exporting():  # most paths do not approach the planes of their triangles
+        near_P = (approach_P > 0) & (distance_P - approach_P < within)
+        values = particle_P, triangle_P, side_P, distance_P, approach_P
+        particle_P, triangle_P, side_P, distance_P, approach_P = (value[near_P] for value in values)
+    row_P24 = barriers.row_F24[triangle_P].to(before_N3.dtype)
+    before_P3, way_P3, normal_P3 = before_N3[particle_P], way_N3[particle_P], row_P24[:, :3]
+    end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
     contact_P = ((distance_P - within) / closing_P).clamp(0, 1)
     crossing_P = (distance_P / closing_P).clamp(0, 1)
     meets_P = _covers(row_P24, before_P3 + contact_P[:, None] * way_P3)
@@ -357,23 +364,7 @@ def _pairs(
         return None
     shift_P = torch.repeat_interleave(start_L - count_L.cumsum(0) + count_L, count_L, output_size=count)
     entry_P = torch.arange(count, device=scene_N.device) + shift_P
-    particle_P, triangle_P = (
-        torch.repeat_interleave(particle_L, count_L, output_size=count),
-        barriers.triangle_E[entry_P],
-    )
-    row_P4 = barriers.row_F24[:, :4][triangle_P].to(before_N3.dtype)
-    _, distance_P, approach_P = _approach(row_P4, before_N3[particle_P], way_N3[particle_P])
-    (near_P,) = torch.nonzero((approach_P > 0) & (distance_P - approach_P < barriers.clearance), as_tuple=True)
-    return particle_P[near_P], triangle_P[near_P]
-
-
-def _approach(
-    row_PX: torch.Tensor, before_P3: torch.Tensor, way_P3: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Returns the side of a triangle's plane, 1 or -1, the distance from it, and the decrease along the path, [P]."""
-    distance_P = (row_PX[:, :3] * before_P3).sum(-1) - row_PX[:, 3]
-    side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
-    return side_P, side_P * distance_P, -side_P * (row_PX[:, :3] * way_P3).sum(-1)
+    return torch.repeat_interleave(particle_L, count_L, output_size=count), barriers.triangle_E[entry_P]
 
 
 def pairs_of_boxes(
