@@ -1,6 +1,7 @@
 """Tests order and resuming: each sample is used once an epoch, and an interruption at any point changes nothing."""
 
 import dataclasses
+import shutil
 import signal
 from itertools import islice
 from typing import Any
@@ -329,21 +330,28 @@ def test_checkpoints_with_other_parts_are_refused(finished, change, message):
         train.main(train_mapping(data, run, maximum_updates=16))
 
 
+@pytest.fixture(scope="module")
+def parameters_after_resuming(finished_once, tmp_path_factory):
+    """The parameters of the training that ended, after four more updates."""
+    data, run, _ = finished_once
+    resumed = shutil.copytree(run, tmp_path_factory.mktemp("resumed") / "run")
+    assert train.main(train_mapping(data, resumed, maximum_updates=16)) == 0
+    return read_checkpoint(resumed / "checkpoints" / "last.ckpt")["state_dict"]
+
+
 @pytest.mark.parametrize(
     "options", [{"maximize": True}, {"betas": (0.9,)}, {"amsgrad": True}, {"differentiable": True}, None]
 )
-def test_the_optimiser_keeps_the_settings_of_this_version(finished, options):
+def test_the_optimiser_keeps_the_settings_of_this_version(finished, parameters_after_resuming, options):
     """Those in a checkpoint, or none in it, change no update of a resumed training."""
     data, run = finished
     path = run / "checkpoints" / "last.ckpt"
     checkpoint = read_checkpoint(path)
-    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
-    expected = read_checkpoint(path)["state_dict"]
     (group,) = checkpoint["optimizer_states"][0]["param_groups"]
     group.update(options) if options else [group.pop(name) for name in ("betas", "eps")]
     torch.save(checkpoint, path)
     assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
-    assert_same(read_checkpoint(path)["state_dict"], expected)
+    assert_same(read_checkpoint(path)["state_dict"], parameters_after_resuming)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
