@@ -95,17 +95,22 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
 
 @contextmanager
 def _ended_as_by_ctrl_c() -> Iterator[list[int]]:
-    """Lets SIGTERM and SIGHUP raise KeyboardInterrupt with their number. Ignored ones (nohup) stay ignored.
+    """Lets the first of SIGTERM and SIGHUP raise KeyboardInterrupt with its number. Ignored ones (nohup) stay ignored.
 
-    Yields the list of received numbers.
+    After a signal further ones are ignored, except Ctrl-C: terminals and services send several, and a command may still
+    write its results. Yields the list of received numbers.
     """
     received: list[int] = []
 
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        raise KeyboardInterrupt(number)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if len(received) == 1:
+            raise KeyboardInterrupt(number)
 
-    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
+    wanted = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    numbers = [n for n in wanted if signal.getsignal(n) is not signal.SIG_IGN]
     before = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield received

@@ -141,22 +141,26 @@ def test_full_disk_of_the_output(streams, main, code):
 @pytest.mark.parametrize("passed_on", [True, False])
 def test_signals(tmp_path, command, number, passed_on):
     """Each command ends on a signal as on Ctrl-C: with a line and its exit code, and without temporary files. The code
-    does not depend on libraries, some of which raise an interruption of their own in place of ours."""
+    does not depend on libraries, some of which raise an interruption of their own in place of ours. More signals, as
+    terminals and services send them, do not interrupt what it still writes."""
 
     def interrupted(_):
         with temporary_file(tmp_path / "a") as temporary:
             temporary.touch()
-            if number == signal.SIGINT:  # which shells ignore in the background
-                raise KeyboardInterrupt
             try:
                 signal.raise_signal(number)
             except KeyboardInterrupt as interruption:
+                for later in (signal.SIGTERM, signal.SIGHUP, signal.SIGHUP):
+                    signal.raise_signal(later)
+                (tmp_path / "kept").touch()
                 raise interruption if passed_on else KeyboardInterrupt from None
 
+    outer = signal.signal(signal.SIGINT, signal.default_int_handler)  # which shells ignore in the background
     before = signal.getsignal(number)
     code, _, error = command("bench", main=interrupted)
-    assert (code, error) == (128 + number, "error: interrupted\n") and not list(tmp_path.iterdir())
+    assert (code, error) == (128 + number, "error: interrupted\n") and [*tmp_path.iterdir()] == [tmp_path / "kept"]
     assert signal.getsignal(number) is before
+    signal.signal(signal.SIGINT, outer)
 
 
 @pytest.mark.parametrize("place", ["pipe", "pipe/a/b", "/dev/null", "/dev/null/a", "link"])
