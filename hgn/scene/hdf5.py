@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import h5py
 
 _DEPTH = 8  # largest depth of groups
-EXPANDED = 1 << 18  # bytes of a compressed chunk that gzip expands to at most 270 MB
+EXPANDED = 1 << 18  # bytes of a dataset's compressed chunks that gzip expands to at most 270 MB
 _CHUNK_BYTES = 512  # of HDF5's memory for a chunk of a few numbers
 # exceptions of h5py for damage, and of NumPy for a size in a damaged file
 _DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
@@ -93,16 +93,19 @@ def open_hdf5(path: Path, rule: str, remedy: str) -> Iterator[h5py.File]:
         raise ConfigError(f"{rule}, got no plain file; {remedy}")
     claims = Claims(path)
     with opened(path) as content, damage_named(rule, remedy), h5py.File(content, "r") as file:
-        _require_own_data(file, path, claims, {h5py.h5o.get_info(file.id).addr})
+        stored = _require_own_data(file, path, claims, {h5py.h5o.get_info(file.id).addr})
+        if stored > content.seek(0, os.SEEK_END):
+            raise ConfigError(f"{path} must store the bytes of each dataset once, got {stored} of them; rewrite it")
         yield file
 
 
-def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: set[int], depth: int = 0) -> None:
+def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: set[int], depth: int = 0) -> int:
     """Raises ConfigError for an object that is in another file, has two names, or is larger than the file.
 
-    HDF5 would read another file with the rights of this reader."""
+    HDF5 would read another file with the rights of this reader. Returns the number of stored bytes of the datasets."""
     import h5py
 
+    total = 0
     for name in group:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
             raise ConfigError(f"{path}: {group.name} must contain its data itself, got a link in {name}")
@@ -111,7 +114,7 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
             raise ConfigError(f"{path}: {group.name} must contain its data itself, got a second name, {name}, for it")
         visited.add(address)
         if isinstance(item, h5py.Group):
-            _require_own_data(item, path, claims, visited, depth + 1)
+            total += _require_own_data(item, path, claims, visited, depth + 1)
         elif isinstance(item, h5py.Dataset):
             if item.external or item.is_virtual:
                 raise ConfigError(f"{path}: {item.name} must be stored in the file itself, got data in another file")
@@ -133,6 +136,7 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
                     raise ConfigError(f"{path}: {item.name} must be {rule}, got filter {number} ({shown}); rewrite it")
             packed = sum(number not in plain for number, _ in filters)
             stored = item.id.get_storage_size()  # HDF5 expands it without a limit
+            total += stored
             written = item.id.get_num_chunks() if chunk else min(stored, 1)
             # HDF5 would read zeros, unless the file names another value
             if item.size and written < count and plan.fill_value_defined() != h5py.h5d.FILL_VALUE_USER_DEFINED:
@@ -142,6 +146,7 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
             if more or (packed and shuffled) or _expands(item, size):
                 rule = f"shuffled first and compressed once, from its {count * size} bytes to fewer"
                 raise ConfigError(f"{path}: {item.name} must be {rule}, got {len(filters)} filters, {stored} bytes")
+    return total
 
 
 def _expands(item: h5py.Dataset, size: int) -> bool:
@@ -149,8 +154,10 @@ def _expands(item: h5py.Dataset, size: int) -> bool:
     chunks: list[Any] = []
     if item.compression == "gzip":
         item.id.chunk_iter(chunks.append)
+    before = 0
     for chunk in chunks:
-        if chunk.size > EXPANDED:
+        before += chunk.size
+        if before > EXPANDED:
             with contextlib.suppress(zlib.error):  # of a chunk that is damaged, or not compressed
                 content = item.id.read_direct_chunk(chunk.chunk_offset)[1]
                 if len(zlib.decompressobj().decompress(content, size + 5)) > size + 4:

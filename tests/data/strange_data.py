@@ -63,21 +63,39 @@ def chunked(file):
     file.create_dataset("00000/position", (1,), "f4", **options)
 
 
-def packed(megabytes, filters, count=64):
-    """A dataset of numbers, 64 unless `count` is given, in one chunk that expands to megabytes of zeros."""
+def packed(megabytes, filters, count=64, chunks=1):
+    """A dataset of numbers in chunks of 64 numbers, or `count`, each of which expands to megabytes of zeros."""
 
     def change(file):
         plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         plan.set_chunk((count,))
         for _ in range(filters):
             plan.set_deflate(9)
-        h5py.h5d.create(file["00000"].id, b"x", h5py.h5t.NATIVE_INT8, h5py.h5s.create_simple((count,)), plan)
+        space = h5py.h5s.create_simple((count * chunks,))
+        h5py.h5d.create(file["00000"].id, b"x", h5py.h5t.NATIVE_INT8, space, plan)
         content = zeros(megabytes)
         for _ in range(filters - 1):
             content = zlib.compress(content)
-        file["00000/x"].id.write_direct_chunk((0,), content)
+        for number in range(chunks):
+            file["00000/x"].id.write_direct_chunk((number * count,), content)
 
     return change
+
+
+def shared(path, count=250_000):
+    """Two hundred datasets whose chunks are all one place of the file, which expands to 220 megabytes."""
+    with h5py.File(path, "r+") as file:
+        chunks = []
+        for number in range(200):
+            packed(0 if number else 220, 1, count)(file)
+            chunks.append(file["00000/x"].id.get_chunk_info(0))
+            file.move("00000/x", f"00000/x{number}")
+    content, first = path.read_bytes(), chunks[0]
+    for chunk in chunks[1:]:
+        old, new = (struct.pack("<IIQQQ", one.size, 0, 0, 0, one.byte_offset) for one in (chunk, first))
+        assert content.count(old) == 1
+        content = content.replace(old, new)
+    path.write_bytes(content)
 
 
 def zeros(megabytes):
@@ -229,6 +247,8 @@ cases(
         "compressed twice": imported("lagrangebench", h5("train.h5", packed(4000, 2))),
         "compressed to more": imported("lagrangebench", h5("train.h5", packed(900, 1))),
         "compressed to far more": imported("lagrangebench", h5("train.h5", packed(9000, 1, 10_000_000))),
+        "compressed to more by chunks": imported("lagrangebench", h5("train.h5", packed(220, 1, 250_000, 4))),
+        "chunks of one place": imported("lagrangebench", lambda folder: shared(folder / "train.h5")),
         "scale and offset": imported(
             "lagrangebench", h5("train.h5", filtered("00001/particle_type", h5py.h5z.FILTER_SCALEOFFSET, (2, 4)))
         ),
