@@ -153,6 +153,7 @@ class _File:
                         raise ValueError(f"{has} a target of {len(moved_V3)} vertices, not {len(position_V3)}")
                     position_V3 = position_V3 + weight * moved_V3
             if "indices" in primitive:
+                self.claims.add("indices", self.tree["accessors"][primitive["indices"]]["count"], 24)
                 index = self.accessor(primitive["indices"], f"{has} indices", "SCALAR", _INDICES)[:, 0].astype(np.int64)
             else:
                 index = np.arange(len(position_V3))

@@ -166,6 +166,20 @@ def far(folder, size):
     return glb(lambda header: header["buffers"][0].update(uri="m.bin", byteLength=size))(folder)
 
 
+def long_strip(folder):
+    """A strip of 60 million triangles, whose indices are a file without blocks on the disk."""
+    os.truncate(saved("m.bin", b"")(folder), 60_000_000)
+
+    def change(header):
+        strip = {"bufferView": len(header["bufferViews"]), "componentType": 5121, "count": 60_000_000, "type": "SCALAR"}
+        header["meshes"][0]["primitives"][0] |= {"mode": 5, "indices": len(header["accessors"])}
+        header["bufferViews"].append({"buffer": len(header["buffers"]), "byteLength": 60_000_000})
+        header["buffers"].append({"uri": "m.bin", "byteLength": 60_000_000})
+        header["accessors"].append(strip)
+
+    return glb(change)(folder)
+
+
 def empty_primitives(header):
     """Primitives without vertices: 3 * 10^8 of them, by nodes."""
     header["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 0, "type": "VEC3"})
@@ -255,6 +269,7 @@ cases(
         "accessor without a view": glb(accessor(count=120_000_000, bufferView=None)),
         "accessor beyond its view": glb(accessor(count=120_000_000)),
         "sparse accessor": glb(sparse),
+        "a long strip": long_strip,
         "accessor of floats": glb(accessor(count=1e300)),
         "instances": glb(instances(1_500)),
         "instances by paths": glb(branching),
