@@ -22,7 +22,7 @@ POINT = 1e-3  # moment of a cube with 1/13 of the edge of a coarsest cell
 @dataclass(frozen=True, eq=False)
 class Groups:
     """Particles in groups, each with the weights of its eight centres. On a CPU bags of rows take a tenth of the time
-    of products and `index_add`; an exported graph cannot contain them, and CUDA graphs not their gradients."""
+    of products and `index_add`; an exported graph cannot contain them, and they have no second derivatives."""
 
     weight_N8: torch.Tensor
     group_N: torch.Tensor
@@ -47,7 +47,7 @@ class Groups:
 
     @property
     def _in_bags(self) -> bool:
-        return self.weight_N8.device.type == "cpu" and not is_exporting()
+        return self.weight_N8.device.type == "cpu" and not (is_exporting() or torch.is_grad_enabled())
 
     @cached_property
     def _members(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

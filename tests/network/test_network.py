@@ -146,6 +146,17 @@ def test_batch_equals_single_scenes(monkeypatch, way):
             assert float((found - expected).abs().max()) < 1e-6 * max(1.0, float(expected.abs().max()))
 
 
+def test_second_derivatives():
+    """They exist on a CPU too: their products with two directions are symmetric."""
+    network, state = network_of(inputs="relative"), random_state((12,), spread=0.1)
+    start_N3, directions = state.position_N3.clone().requires_grad_(), torch.randn(2, 12, 3, dtype=torch.float64)
+    mean = network.normalised_acceleration(replace(state, position_N3=start_N3)).square().mean()
+    (slope_N3,) = torch.autograd.grad(mean, start_N3, create_graph=True)
+    bent = [torch.autograd.grad((slope_N3 * v).sum(), start_N3, retain_graph=True)[0] for v in directions]
+    assert float(bent[0].norm()) > 0
+    torch.testing.assert_close((bent[0] * directions[1]).sum(), (bent[1] * directions[0]).sum())
+
+
 @pytest.mark.parametrize(
     ("counts", "rows", "kind", "threads", "changes"),
     [
