@@ -34,6 +34,7 @@ from hgn.scene.scene import Obstacle
 from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds, strict_json, triple
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
+from hgn.system.processes import signals_delayed
 
 if TYPE_CHECKING:
     import h5py
@@ -153,7 +154,7 @@ def write_frames(path: Path, rollout: Rollout, simulate: Simulation) -> None:
     Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
-    with space_reserved(path, size) as release, _growing_file(path, rollout) as file:
+    with contextlib.ExitStack() as end, space_reserved(path, size) as release, _growing_file(path, rollout) as file:
 
         def append(count: int) -> None:
             if time.monotonic() - file.written_s > WRITE_EVERY_S:
@@ -161,6 +162,7 @@ def write_frames(path: Path, rollout: Rollout, simulate: Simulation) -> None:
                 file.write(count)
 
         count, interruption = take_frames(rollout, simulate, append)
+        end.enter_context(signals_delayed())  # one of them would now lose all frames
         release(size)
         file.write(count)
     raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {path}")
@@ -390,8 +392,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     count_T = vtk["NumberOfPoints"][()]
     points, material_P = vtk["Points"], vtk["PointData/material"][()]
     vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # vertices of obstacles precede the particles
-    material_N = material_P[vertices:]
-    shape = (len(count_T), len(material_N), 3)
+    shape = (len(count_T), len(material_N := material_P[vertices:]), 3)
     entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)
     claims.add("frames x points", len(count_T), len(material_P), 13)
     shown_TP = np.concatenate([np.zeros(vertices, np.int64), entry_N]) <= np.arange(shape[0])[:, None]

@@ -1,7 +1,9 @@
-"""Rollouts on a disk that refuses data for a while or for good; a limit on the size of files stands in for it."""
+"""Rollouts on a disk that refuses data for a while or for good; a limit on the size of files stands in for it. And
+signals at the end of a file."""
 
 import dataclasses
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from scene.test_rollout_file import contents, growing
 
 from hgn.scene import rollout_file
 from hgn.scene.hdf5 import FileOnDisk
-from hgn.scene.rollout_file import write_frames, write_rollout
+from hgn.scene.rollout_file import read_rollout, write_frames, write_rollout
 
 
 @pytest.fixture
@@ -57,3 +59,19 @@ def test_refused_data(tmp_path, monkeypatch, request, refused, how, size, lastin
         write_frames(path, dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan)), simulate)
     np.testing.assert_equal(contents(path), expected)
     assert [each.name for each in tmp_path.iterdir()] == ["a.vtkhdf"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("name", ["_extend", "sync_written", "sync_folder"])
+def test_signals_while_a_file_is_completed(tmp_path, monkeypatch, number, name):
+    """They end the command when the file is complete, in the handler of before."""
+    whole, path, function = growing(), tmp_path / "a.vtkhdf", getattr(rollout_file, name)
+    outer = signal.signal(number, signal.default_int_handler)
+    monkeypatch.setattr(rollout_file, name, lambda *given: (signal.raise_signal(number), function(*given)))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_frames(path, whole, lambda take: list(map(take, whole.position_TN3)))
+        assert signal.getsignal(number) is signal.default_int_handler
+    finally:
+        signal.signal(number, outer)
+    assert read_rollout(path).frame_count == whole.frame_count and [*tmp_path.iterdir()] == [path]
