@@ -40,7 +40,7 @@ TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
 # At its walls random states begin, or end, for some particles, and their ways meet the triangles below.
 WALLED = {"wall_clearance": (0.1, 0.7)}
-OWN = WALLED | {"inputs": "local", "own_physics": OWN_PHYSICS, "materials": MATERIALS, "levels": 3}
+OWN = WALLED | {"inputs": "local", "own_physics": OWN_PHYSICS, "materials": MATERIALS, "levels": 2}
 OWN = OWN | {"obstacle_distance": True}
 WHOLE = WALLED | {"inputs": "relative", "rest_threshold": 0.3, "obstacle_clearance": 1e-3, "levels": 1}
 SIZES = [(particles, obstacles) for particles in (1, 216, 3_000) for obstacles in (True, False)]
@@ -153,10 +153,10 @@ def as_own(tmp_path_factory):
     scope="module", params=["as_own", *(pytest.param(x, marks=pytest.mark.slow) for x in ("", "as_package"))]
 )
 def as_onnx(request, tmp_path_factory):
-    """A network as ONNX: one of these, or one of absolute inputs on two levels with walls."""
+    """A network as ONNX: one of these, or one of absolute inputs on three levels with walls."""
     if request.param:
         return request.getfixturevalue(request.param)
-    return exported(tmp_path_factory.mktemp("onnx"), ("onnx",), WALLED | {"levels": 2})
+    return exported(tmp_path_factory.mktemp("onnx"), ("onnx",), WALLED | {"levels": 3})
 
 
 def test_operators_of_torchvision_are_not_missed(caplog):
