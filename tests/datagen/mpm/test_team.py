@@ -81,10 +81,9 @@ MOVING = lifted(sheet(0.3), shape_obstacle("pyramid", 0.2, (0.4, 0.15, 0.4)))
     ("config", "scenes", "team", "tolerance"),
     [
         (MpmConfig(device="cpu", fixed_time_step_s=1e-3), [HEAVY], Team(1), 1e-3),
-        (CONFIG, [mixed(120, 0, (0, -3, 0)), HEAVY, FAILING], Team(1, 2, 1), 1e-5),
-        (CONFIG, [MOVING, HEAVY], Team(1, 2, 1), 1e-5),
+        (CONFIG, [MOVING, HEAVY, FAILING], Team(1, 2, 1), 1e-5),
     ],
-    ids=["each step is an interval", "two blocks", "moving obstacles"],
+    ids=["each step is an interval", "two blocks and moving obstacles"],
 )
 def test_other_kernels_agree(config, scenes, team, tolerance):
     """Kernels without separate steps of particles, and scenes of two blocks that wait for each other, next to one that
@@ -145,7 +144,7 @@ def test_blocks_that_are_not_at_work_at_once(monkeypatch):
     a launch, with the same result."""
     monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
     monkeypatch.setattr(team_launch, "PATIENCE", (10_000, 10_000))
-    scenes = [mixed(120, 0, (0, -3, 0)), HEAVY]
+    scenes = [MOVING, HEAVY]  # of which kernels are compiled already
     expected, _ = simulated(scenes, frames=4)
     with pytest.warns(RuntimeWarning, match="does not run the 3 blocks of 1 threads of a scene concurrently"):
         found, _ = simulated(scenes, frames=4, team=Team(1, 3, 1))
