@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_108,
     "datagen": 8_964,
     "tools": 6_296,
-    "tests": 36_909,
+    "tests": 36_916,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

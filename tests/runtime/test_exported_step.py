@@ -418,12 +418,19 @@ def drawn_physics(state, config):
 
 
 def assert_rollout(written, found_TN3):
-    """The frames of backend torch, in some of which obstacles stop particles if they can."""
+    """The frames of backend torch, in some of which obstacles stop particles if they can.
+
+    Rounding decides whether an obstacle stops a few of them, so these may differ: between float32 and float64, with
+    obstacles, 1.1 % of the particles do.
+    """
     simulator, scene = Simulator(written.network, 60.0, "torch"), load_scene(written.folder / "scene.yaml")
     (expected_TN3,) = simulator.rollout([scene], FRAMES)
-    np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
-    if written.network.step.obstacle_clearance is None:
+    clearance = written.network.step.obstacle_clearance
+    off_N = (np.abs(found_TN3 - expected_TN3) > FRAMES * TOLERANCE).any((0, 2))
+    assert off_N.mean() <= (0.0 if clearance is None else 0.005)
+    if clearance is None:
         return
+    np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=5 * clearance)
     state = replace(simulator.start([scene]), barriers=None)
     for _ in range(FRAMES - 1):
         state = simulator.step(state)
