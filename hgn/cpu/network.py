@@ -158,7 +158,7 @@ def _to_children(
 def _to_cells(rows: Rows, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
     """Returns the finest cells [C, W] (step 1 of the paper)."""
     particles, count = len(particle_NW), grid.levels[0].cell_count
-    cell_P, pair_P = torch.sort(grid.cell_N8.flatten().int(), stable=True)  # takes half as long as int64
+    cell_P, pair_P = torch.sort(grid.cells.flatten().int(), stable=True)  # takes half as long as int64
     blocks = _Blocks(cell_P, count, threads)
     ends = blocks.indices(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1))
     # The table has the products of the hidden layer with particles and with corners.
@@ -167,7 +167,7 @@ def _to_cells(rows: Rows, particle_NW: torch.Tensor, grid: GridHierarchy, thread
     _project(rows, table_NW[:particles], threads, (0, particle_NW), (1, -grid.fraction_N3))
     sum_CW = particle_NW.new_zeros(count, particle_NW.shape[1])
     sums = blocks.split(sum_CW)
-    segments = blocks.segments(grid.weight_N8.flatten()[pair_P])
+    segments = blocks.segments(grid.groups.weight_N8.flatten()[pair_P])
 
     def add(block: int) -> None:
         rows.add_sums(sums[block], Hidden(table_NW, ends[block], 2), segments[block])
@@ -189,7 +189,7 @@ def _to_particles(
     runs = _runs(particles, ROWS_AT_ONCE // 8, threads)
     result, after_NW = particle_NW.new_empty(particles, len(decode.second_bias)), particle_NW.clone()
     own_N1 = (torch.arange(particles) + others)[:, None]
-    all_of = (grid.cell_N8, own_N1, grid.weight_N8, after_NW, result)
+    all_of = (grid.cells, own_N1, grid.groups.weight_N8, after_NW, result)
     cell, own, weight, after, results = (x.split_with_sizes(runs) for x in all_of)
     corner_8, offset = torch.arange(8) + count, torch.arange(0, 8 * max(runs) + 1, 8)
 

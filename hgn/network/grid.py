@@ -56,11 +56,16 @@ class GridHierarchy:
     """All levels, finest first, and the 8 cells of each particle. Particles with the same cells form a group."""
 
     levels: tuple[Level, ...]
-    cell_N8: torch.Tensor  # int64, index into the finest level; corner order of CORNER_83
-    weight_N8: torch.Tensor  # trilinear, sums to 1; some are zero if the particle lies on a plane of cell centres
     fraction_N3: torch.Tensor  # particle minus the centre of its first corner's cell, in cells, [0, 1)
-    cell_G8: torch.Tensor  # `cell_N8` of each group
-    groups: Groups
+    cell_G8: torch.Tensor  # the cells of each group: int64, index into the finest level; corner order of CORNER_83
+    groups: (
+        Groups  # with trilinear weights, which sum to 1; some are zero if the particle lies on a plane of cell centres
+    )
+
+    @cached_property
+    def cells(self) -> torch.Tensor:
+        """Returns the eight finest cells of each particle, `cell_G8` of its group, [N, 8]."""
+        return self.cell_G8[self.groups.group_N]
 
     @cached_property
     def finest(self) -> Centres:
@@ -131,9 +136,7 @@ def build_hierarchy(
             parent_key, body_C = parent_key[parent], owned - finest_count * parent  # ONNX has no % by a size
         built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant(coordinate_C3 & 1)))
         key_C = parent_key
-    weight_N8 = trilinear(fraction_N3)
-    groups = Groups(weight_N8, group_N, key_G.shape[0])
-    return GridHierarchy(tuple(built), cell_G8[group_N], weight_N8, fraction_N3, cell_G8, groups)
+    return GridHierarchy(tuple(built), fraction_N3, cell_G8, Groups(trilinear(fraction_N3), group_N, key_G.shape[0]))
 
 
 def trilinear(fraction_N3: torch.Tensor) -> torch.Tensor:

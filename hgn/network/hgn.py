@@ -124,8 +124,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         corner_8H = network.project(1, corner_83) + network.first.bias
         hidden_NH = network.project(0, particle_NW)
         network.add_projection(hidden_NH, 1, -grid.fraction_N3)
-        message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.weight_N8[..., None])
-        cell_CW = _scatter(message_N8W, grid.cell_N8, grid.levels[0].cell_count)
+        message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.groups.weight_N8[..., None])
+        cell_CW = _scatter(message_N8W, grid.cells, grid.levels[0].cell_count)
 
         cells_down: list[torch.Tensor] = []
         for i, level in enumerate(grid.levels):
@@ -153,10 +153,10 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         corner_8H = network.project(2, corner_83) - network.first.bias
         hidden_NH = network.project(1, particle_NW)
         network.add_projection(hidden_NH, 2, grid.fraction_N3)
-        cell_N8H = cell_CH.index_select(0, grid.cell_N8.flatten()).unflatten(0, (-1, 8))
+        cell_N8H = cell_CH.index_select(0, grid.cells.flatten()).unflatten(0, (-1, 8))
         hidden_N8H = cell_N8H + hidden_NH[:, None]
         hidden_N8H -= corner_8H
-        change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[..., None]).sum(1)
+        change_NW = network.finish(hidden_N8H).mul_(grid.groups.weight_N8[..., None]).sum(1)
         output: torch.Tensor = self.decode(particle_NW + change_NW)
         return output
 

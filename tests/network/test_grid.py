@@ -38,13 +38,13 @@ def test_hierarchy_is_what_the_definition_says(particles, scenes):
     scene = torch.tensor(scenes[: len(particles)])
     origin = torch.tensor([[0.0, 0, 0], [-0.1, -0.2, -0.05], [-0.25, 0, -0.125]], dtype=torch.float64)
     grid = build(particles, scene, origin, levels=3)
-    torch.testing.assert_close(grid.weight_N8.sum(1), torch.ones(len(particles), dtype=torch.float64))
+    torch.testing.assert_close(grid.groups.weight_N8.sum(1), torch.ones(len(particles), dtype=torch.float64))
 
     u = (torch.tensor(particles, dtype=torch.float64) - origin[scene]) / SIZE - 0.5
     expected = set()
     for particle in range(len(particles)):
         base = torch.floor(u[particle])
-        for corner, weight in zip(CORNER_83.tolist(), grid.weight_N8[particle].tolist(), strict=True):
+        for corner, weight in zip(CORNER_83.tolist(), grid.groups.weight_N8[particle].tolist(), strict=True):
             if weight != 0:
                 cell = [int(b) + c for b, c in zip(base.tolist(), corner, strict=True)]
                 expected.add((int(scene[particle]), *cell))
@@ -83,7 +83,7 @@ def test_cells_of_bodies(particles):
     """With `bodies` a hierarchy is the union of those of the bodies, each alone. Particles of a body share cells,
     directly or through others."""
     plain, divided = (build(particles, levels=3, bodies=bodies) for bodies in (False, True))
-    reached = [set(plain.cell_N8[i].tolist()) for i in range(len(particles))]
+    reached = [set(plain.cells[i].tolist()) for i in range(len(particles))]
     bodies: list[set[int]] = []
     for i in range(len(particles)):
         joined = [body for body in bodies if any(reached[i] & reached[k] for k in body)]
@@ -96,7 +96,7 @@ def test_cells_of_bodies(particles):
         return listed, {(listed[s], listed[r]) for s, r in zip(level.sender_E, level.receiver_E, strict=True)}
 
     body_of = {i: number for number, body in enumerate(bodies) for i in body}
-    ancestor_N8, names = divided.cell_N8, []
+    ancestor_N8, names = divided.cells, []
     for depth, level in enumerate(divided.levels):
         name: dict[int, tuple[int, ...]] = {}
         for i, row in enumerate(ancestor_N8.tolist()):
