@@ -34,7 +34,7 @@ def prediction(
 ) -> Prediction:
     """Returns the result of the network's own `prediction`, without gradients."""
     with torch.no_grad():
-        return network.predicted(state, network.grid(state, origin_S3), partial(propagate, network))
+        return network.predicted(state, origin_S3, partial(propagate, network))
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

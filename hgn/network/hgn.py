@@ -17,6 +17,7 @@ from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
+from hgn.network.images import Image
 from hgn.network.mlp import MLP
 from hgn.network.origins import frame_origin
 from hgn.network.relative import OUTPUTS, balanced
@@ -83,15 +84,20 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         return self.prediction(state, origin_S3).acceleration_N3
 
     def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
-        return self.predicted(state, self.grid(state, origin_S3), self.propagate)
+        return self.predicted(state, origin_S3, self.propagate)
 
     def predicted(
         self,
         state: ParticleState,
-        grid: GridHierarchy,
+        origin_S3: torch.Tensor | None,
         propagate: Callable[[torch.Tensor, GridHierarchy], torch.Tensor],
     ) -> Prediction:
-        """Returns the prediction on a grid. `propagate` computes steps 1 to 12."""
+        """Returns the prediction: without `origin_S3` in the image of the frame. `propagate` computes steps 1 to 12."""
+        if origin_S3 is None and self.origin_range and self.config.relative:
+            image = Image.of(state, self.step, self.config.dimensions)
+            shown = self.predicted(image.shown(state), self.origin(state), propagate)
+            return Prediction(image.sign_S3[state.scene_N] * shown.acceleration_N3, shown.contacts, shown.grid)
+        grid = self.grid(state, origin_S3)
         if not self.config.relative:
             return Prediction(propagate(self.encode_particles(state, grid), grid))
         feature_NF, contacts = self.relative_features(state, grid)
@@ -104,11 +110,14 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         if its cells move, `mechanics` no longer passes rest over 3,000 frames (sand ends 1.5 times as dense)."""
         return 0.0 if self.step.rests else self.config.cell_size
 
+    def origin(self, state: ParticleState) -> torch.Tensor:
+        """Returns the origins of the grids of scenes at their frames, [S, 3]."""
+        return frame_origin(state.frame_S, self.origin_range, self.config.dimensions).to(state.domain_S3)
+
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """Returns the cells of all levels around a state's particles."""
         cell_size, levels, bodies = self.config.cell_size, self.config.levels, self.config.body_cells
-        if origin_S3 is None:
-            origin_S3 = frame_origin(state.frame_S, self.origin_range, self.config.dimensions).to(state.domain_S3)
+        origin_S3 = self.origin(state) if origin_S3 is None else origin_S3
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, cell_size, levels, bodies)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

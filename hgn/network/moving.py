@@ -74,6 +74,13 @@ class Poses:
         pivot_V3, place_V3 = (turned(x, map_V33) + shift_V3 for x in (self.pivot_V3, self.place_V3))
         return Poses(rotation_V33, pivot_V3, place_V3, change_V33, turned(self.shift_V3, map_V33))
 
+    def mirrored(self, sign_V3: torch.Tensor, shift_V3: torch.Tensor) -> Poses:
+        """Returns the poses x -> sign (R (x - c) + p) + shift: the images of the obstacles, with the same cells."""
+        sign_V3 = sign_V3.to(self.place_V3)
+        rotation_V33 = sign_V3[:, :, None] * self.rotation_V33
+        change_V33 = sign_V3[:, :, None] * self.change_V33 * sign_V3[:, None]
+        return Poses(rotation_V33, self.pivot_V3, sign_V3 * self.place_V3 + shift_V3, change_V33, sign_V3 * self.shift_V3)
+
     def undo(self, position_V3: torch.Tensor) -> torch.Tensor:
         """Moves a point of each row to the coordinates of the row's cells."""
         return turned(position_V3 - self.place_V3, self.rotation_V33.mT) + self.pivot_V3

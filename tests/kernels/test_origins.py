@@ -44,11 +44,11 @@ def bits(value):
 
 
 def expected_path(network, state, frames, moving=True):
-    """Positions [T, N, 3] of the next frames of the plain loop, with the origins of its frames or with origin 0."""
+    """Positions [T, N, 3] of the next frames of the plain loop, with origins and images of its frames, or without."""
     path = []
     for _ in range(frames):
-        origin_S3 = frame_origin(state.frame_S, network.origin_range, network.config.dimensions)
-        acceleration_N3 = accelerations(network, state, network.prediction(state, moving * origin_S3))
+        origin_S3 = None if moving else torch.zeros_like(state.domain_S3)
+        acceleration_N3 = accelerations(network, state, network.prediction(state, origin_S3))
         state = advanced(state, acceleration_N3.detach(), network.step, network.config.dimensions)
         path.append(state.position_N3)
     return torch.stack(path).cpu().numpy()
