@@ -93,7 +93,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         propagate: Callable[[torch.Tensor, GridHierarchy], torch.Tensor],
     ) -> Prediction:
         """Returns the prediction: without `origin_S3` in the image of the frame. `propagate` computes steps 1 to 12."""
-        if origin_S3 is None and self.origin_range and self.config.relative:
+        if origin_S3 is None and self.images:
             image = Image.of(state, self.step, self.config.dimensions)
             shown = self.predicted(image.shown(state), self.origin(state), propagate)
             return Prediction(image.sign_S3[state.scene_N] * shown.acceleration_N3, shown.contacts, shown.grid)
@@ -109,6 +109,11 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         """Returns the range of the grid origins of simulations (hgn.network.origins). It is 0 with the rest constraint:
         if its cells move, `mechanics` no longer passes rest over 3,000 frames (sand ends 1.5 times as dense)."""
         return 0.0 if self.step.rests else self.config.cell_size
+
+    @property
+    def images(self) -> bool:
+        """Returns whether simulations predict their frames in images (hgn.network.images)."""
+        return self.config.relative and self.origin_range > 0
 
     def origin(self, state: ParticleState) -> torch.Tensor:
         """Returns the origins of the grids of scenes at their frames, [S, 3]."""

@@ -18,6 +18,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.step_config import StepConfig
 
 IMAGES = ((1, 1, 1), (-1, 1, -1))  # signs of the axes; frames take them in turn, and frame 0 the first
+MIRRORS = sum((sign < 0) << 3 * i + axis for i, image in enumerate(IMAGES) for axis, sign in enumerate(image))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork
-from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, DeviceParticles, Window
+from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, DeviceImage, DeviceParticles, Window
 from hgn.kernels.moving import MovingTable
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
@@ -27,6 +27,7 @@ from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.images import Image
 from hgn.network.moving import MovingObstacles
 from hgn.network.origins import frame_origin
 from hgn.network.own_physics import has_friction
@@ -35,7 +36,7 @@ from hgn.runtime.parity import OUTPUTS, ParityError, require_parity
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.step.reference import rested
-from hgn.step_config import StepConfig
+from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.system.machine import available_cpus
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4  # largest and smallest number of frames in a block
@@ -124,6 +125,11 @@ class TritonStepper:
         self.buffers = DeviceParticles.empty(
             self.particles, self.scenes, self.config.velocity_history, self.device, own_physics=self.own_physics
         )
+        if network.images:
+            near, far = network.step.wall_clearance or (0.0, 0.0)
+            names = ("domain_S3", "gravity_S3", "position_N3", "velocity_NV")
+            copies = (torch.zeros_like(getattr(self.buffers, name)) for name in names)
+            self.buffers = replace(self.buffers, image=DeviceImage(*copies, near - far))
         self.lost, self.frame = (torch.zeros(1, dtype=torch.int32, device=self.device) for _ in range(2))
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
@@ -221,6 +227,10 @@ class TritonStepper:
         buffers.origin_S3.copy_(frame_origin(state.frame_S, self.origin_range, self.config.dimensions))
         if self.config.relative:
             buffers.gravity_S3.copy_(state.gravity_S3)
+        if buffers.image is not None:
+            sign_S3 = Image.of(state, UNCONSTRAINED, self.config.dimensions).sign_S3
+            buffers.image.sign_S3.copy_(sign_S3)
+            buffers.image.gravity_S3.copy_(sign_S3 * state.gravity_S3)
         if buffers.wall_friction_S3 is not None:
             friction_S3 = state.wall_friction_S3
             buffers.wall_friction_S3.copy_(torch.zeros_like(state.domain_S3) if friction_S3 is None else friction_S3)
@@ -268,6 +278,9 @@ class TritonStepper:
 
     def _window(self) -> Window:
         position_N3 = self.buffers.position_N3[: self.live]
+        if (image := self.buffers.image) is not None:
+            scene_N = self.buffers.scene_N[: self.live].long()
+            position_N3 = torch.cat([position_N3, self.buffers.domain_S3[scene_N] + image.fold - position_N3])
         box = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
         size = self.buffers.domain_S3.amax(0).cpu()
         lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
@@ -333,6 +346,8 @@ class TritonStepper:
         if self.graph is None:
             self._network_pass()
         output_N3 = self.fused.output[: len(state.position_N3), :3]
+        if self.buffers.image is not None:
+            output_N3 = self.buffers.image.sign_S3[state.scene_N.long()] * output_N3
         with torch.no_grad():
             expected_N3 = rested(network, state, network.prediction(state), self.step_config)
             require_parity(output_N3, expected_N3, OUTPUTS, self.precision, section=section)

@@ -18,6 +18,33 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 
 @triton.jit
+def show_image(
+    position, velocity, scene_of, domain, sign, particle_count, image_position, image_velocity, fold,
+    HISTORY: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the images of positions [N, 3] and velocity histories [N, 3 HISTORY], by the scenes' `sign` [S, 3].
+
+    Rule: hgn.network.images; test: tests/kernels/test_images.py.
+    """
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, COLUMNS)[None, :]
+    live = (row < count)[:, None] & (column < 3 * HISTORY)
+    scene = tl.load(scene_of + row, mask=row < count, other=0)
+    entry = scene[:, None] * 3 + column % 3
+    factor = tl.load(sign + entry, mask=live, other=1.0)
+    at = row[:, None] * (3 * HISTORY) + column
+    tl.store(image_velocity + at, factor * tl.load(velocity + at, mask=live, other=0.0), mask=live)
+    is_place = live & (column < 3)
+    at = row[:, None] * 3 + column
+    shift = tl.where(factor < 0, tl.load(domain + entry, mask=is_place, other=0.0) + fold, 0.0)
+    x = tl.load(position + at, mask=is_place, other=0.0)
+    tl.store(image_position + at, factor * x + shift, mask=is_place)
+
+
+@triton.jit
 def mark_cells(
     position, scene_of, origin, particle_count, low, geometry, occupied, reached, status, cell_size,
     LEVELS: tl.constexpr, BODIES: tl.constexpr, BLOCK: tl.constexpr,
@@ -177,11 +204,11 @@ def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, turn,
-    surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity,
+    surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity, place, way, sign,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, REACH: tl.constexpr, FEATURES: tl.constexpr,
     FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, BODIES: tl.constexpr,
-    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    OVERLAP: tl.constexpr, IMAGE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
@@ -192,7 +219,8 @@ def prepare_particles(
     (`moments` [C, COLUMNS]). It raises column 1 of the coarsest cells' `disturbed` [C, 2] to at least the contact times
     FULLY. With FRICTION, a number of columns, `add_friction` writes these from FRICTION_AT on and adds to `friction`
     [C, COLUMNS]. With MOVING it writes V (`surfaces_of`) to `surface_of` [N, 3], and `add_drift` adds V to `drift`
-    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features, REACH as in obstacle_normals.
+    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features, REACH as in obstacle_normals. `place`, `way`,
+    `sign` and IMAGE are those of surfaces_of.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -207,7 +235,8 @@ def prepare_particles(
     if MOTION:
         surfaces, touch, surface = surfaces_of(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses,
-            turn, scenes, HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3, REACH, MOVING,
+            turn, scenes, place, way, sign, HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3, REACH, MOVING,
+            IMAGE,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]

@@ -78,6 +78,17 @@ def feature_columns(config: NetworkConfig) -> int:
 
 
 @dataclass(frozen=True, eq=False)
+class DeviceImage:
+    """Holds the image of the particles that the network sees in this frame (hgn.network.images)."""
+
+    sign_S3: torch.Tensor
+    gravity_S3: torch.Tensor
+    position_N3: torch.Tensor  # those of the image, written at the beginning of a frame
+    velocity_NV: torch.Tensor
+    fold: float  # near - far of hgn.network.images
+
+
+@dataclass(frozen=True, eq=False)
 class DeviceParticles:
     """Holds the particles of all scenes, padded to the size of the buffers, and the scene of each particle."""
 
@@ -94,6 +105,7 @@ class DeviceParticles:
     # columns of hgn.network.own_physics; None: all are 0. With `rest_NR` those of elastic bodies follow.
     parameter_NP: torch.Tensor | None = None
     rest_NR: torch.Tensor | None = None  # RestShape.packed with rows of the buffers; None: no body is elastic
+    image: DeviceImage | None = None  # None: the network sees the particles themselves
 
     @staticmethod
     def empty(
@@ -226,10 +238,18 @@ class DeviceGrid:
         return self.counts_L[level : level + 1]
 
     def build(self, particles: DeviceParticles) -> None:
-        """Marks, numbers and tabulates the cells of all levels."""
+        """Marks, numbers and tabulates the cells of all levels around particles, or around their image."""
         self._cleared.zero_()
+        if (image := particles.image) is not None:
+            history = self.config.velocity_history
+            kernel.show_image[(triton.cdiv(self.particles, MARK_BLOCK),)](
+                position=particles.position_N3, velocity=particles.velocity_NV, scene_of=particles.scene_N,
+                domain=particles.domain_S3, sign=image.sign_S3, particle_count=particles.count,
+                image_position=image.position_N3, image_velocity=image.velocity_NV, fold=image.fold, HISTORY=history,
+                COLUMNS=triton.next_power_of_2(3 * history), BLOCK=MARK_BLOCK,
+            )  # fmt: skip
         kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
-            position=particles.position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
+            position=(image or particles).position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
             particle_count=particles.count, low=self.low, geometry=self.geometry, occupied=self.occupied,
             reached=self._reached, status=self.status, cell_size=self.cell_size, LEVELS=self.levels,
             BODIES=self.config.body_cells, BLOCK=MARK_BLOCK,
@@ -274,13 +294,15 @@ class DeviceGrid:
         `scale` is Normaliser.feature_scale. With `symmetry` the kernel applies the symmetries in the obstacles' rows.
         """
         config, blocks, overlap = self.config, (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
+        image = particles.image
+        seen = image or particles
         walls, parameter_NP, column = particles.wall_friction_S3, particles.parameter_NP, own_physics_column(config)
         self.friction = self._widths[0] if walls is not None else 0
         own_physics = {"FRICTION": self.friction, "FRICTION_AT": column}
         drift: dict[str, Any] = {"surface_of": self.surface_N3, "drift": self.drift_C8}
         drift["MOVING"] = moving.layers if moving is not None and config.obstacle_features else 0
         surfaces: dict[str, Any] = {
-            "position": particles.position_N3, "velocity": particles.velocity_NV, "scene_of": particles.scene_N,
+            "position": seen.position_N3, "velocity": seen.velocity_NV, "scene_of": particles.scene_N,
             "domain": particles.domain_S3, "particle_count": particles.count,
             "obstacle_table": obstacles.row_SC if obstacles else particles.count,
             "obstacle_cell_size": next((table.cell_size for table in (obstacles, moving) if table), 1.0),
@@ -292,17 +314,19 @@ class DeviceGrid:
         if particles.rest_NR is not None:
             assert parameter_NP is not None
             feature_kernel.deform[blocks](
-                position=particles.position_N3, rest=particles.rest_NR, particle_count=particles.count, scale=scale[1],
+                position=seen.position_N3, rest=particles.rest_NR, particle_count=particles.count, scale=scale[1],
                 columns=parameter_NP, WIDTH=parameter_NP.shape[1], AT=parameter_NP.shape[1] - elastic.COLUMNS,
                 BLOCK=PARTICLE_BLOCK,
             )  # fmt: skip
         kernel.prepare_particles[blocks](
-            **surfaces, origin=particles.origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
+            **surfaces, place=particles.position_N3, way=particles.velocity_NV,
+            sign=particles.domain_S3 if image is None else image.sign_S3, IMAGE=image is not None,
+            origin=particles.origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
             fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
-            gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
+            gravity=seen.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
             **self._owners, BODIES=self.config.body_cells, REACH=REACH_CELLS if config.obstacle_distance else 0.0,
             MOTION=config.relative, COLUMNS=SUMS, **own_physics, **drift, **arguments_of(moving, particles.count),
@@ -321,8 +345,8 @@ class DeviceGrid:
             OVERLAP=overlap, BLOCK=MARK_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
         feature_kernel.prepare_relative_features[blocks](
-            velocity=particles.velocity_NV, scene_of=particles.scene_N, material_of=particles.material_N,
-            gravity=particles.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
+            velocity=seen.velocity_NV, scene_of=particles.scene_N, material_of=particles.material_N,
+            gravity=seen.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
             weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, share_of=self.share_N8, motion=self.motion_C4,
             parent=self._parent, geometry=self.geometry, features=self.feature_NF, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, felt=self.felt_C2,

@@ -62,13 +62,14 @@ def _with_moving(
 @triton.jit
 def surfaces_of(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses, turn,
-    scenes, HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr,
-    REACH: tl.constexpr, MOVING: tl.constexpr,
+    scenes, place_of, way_of, sign, HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
+    ROW: tl.constexpr, REACH: tl.constexpr, MOVING: tl.constexpr, IMAGE: tl.constexpr,
 ):  # fmt: skip
     """Returns three results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal
     ahead, friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0
     if no surface is within reach, at most 1. The third is V (hgn.network.moving), three components [N], if MOVING, the
-    largest number of moving obstacles of a scene, is not 0."""
+    largest number of moving obstacles of a scene, is not 0. With IMAGE positions and velocities are those of an image
+    by the scenes' `sign` [S, 3], and those of the scene are `place_of` and `way_of`, which look up obstacles."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -85,8 +86,8 @@ def surfaces_of(
         asked = live[:, None] & (quarters <= STEPS)
         time = quarters.to(tl.float32) / STEPS
         if OBSTACLES:
-            at = position + row[:, None] * 3 + 0 * quarters
-            v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
+            at = place_of + row[:, None] * 3 + 0 * quarters
+            v_at = way_of + row[:, None] * (3 * HISTORY) + 0 * quarters
             x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
             y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
             z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
@@ -97,9 +98,15 @@ def surfaces_of(
             normal = none, none, none, none
         if MOVING > 0:
             normal = _with_moving(
-                normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time + 0.0 * touch[:, None],
+                normal, place_of, way_of, row, live, scene, moving, poses, turn, scenes, time + 0.0 * touch[:, None],
                 asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, REACH, MOVING,
             )  # fmt: skip
+        if IMAGE:
+            shown = ()
+            for i in tl.static_range(ROW if MOVING == 0 else 7):
+                factor = tl.load(sign + scene * 3 + (i if i < 3 else (i + 2) % 3), mask=live, other=1.0)[:, None]
+                shown = shown + (normal[i] if i == 3 else factor * normal[i],)  # noqa: RUF005
+            normal = shown
         found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
         ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
         for i in tl.static_range(ROW):

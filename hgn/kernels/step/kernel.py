@@ -12,6 +12,7 @@ from hgn.kernels.geometry import GEOMETRY_COLUMNS, lowest_middle, middles_around
 from hgn.kernels.obstacles import BARRIER_COLUMNS
 from hgn.kernels.step.barriers import between_walls, stopped_by_moving, stopped_by_obstacles, wall_limit
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
+from hgn.network import images
 from hgn.network.origins import FRACTION_BITS, STEPS
 from hgn.step.reference import LEAST, SURE
 
@@ -20,6 +21,7 @@ SURELY, TINY = tl.constexpr(SURE), tl.constexpr(LEAST)
 DIVERGED = tl.constexpr(4)
 X_STEP, Y_STEP, Z_STEP = (tl.constexpr(step) for step in STEPS)
 DROPPED_BITS, FRACTION_UNIT = tl.constexpr(32 - FRACTION_BITS), tl.constexpr(1 / 2**FRACTION_BITS)
+MIRRORS = tl.constexpr(images.MIRRORS)
 SCENE_BLOCK = tl.constexpr(32)  # scenes that `advance` handles together
 
 
@@ -214,13 +216,14 @@ def stop_slow(
 @triton.jit
 def integrate(
     output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
-    near, far, barrier_table, moving, poses, turn, scenes, within, slack, least_crease, OUT: tl.constexpr,
+    near, far, barrier_table, moving, poses, turn, scenes, within, slack, least_crease, sign, OUT: tl.constexpr,
     HISTORY: tl.constexpr, COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr,
-    MOVING: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    MOVING: tl.constexpr, OVERLAP: tl.constexpr, IMAGE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes v += a, x += v, and writes the new positions into path [T, N, 3] at `frame`.
 
-    The acceleration a is gravity plus std times the output plus mean. If the status is not zero, nothing changes.
+    The acceleration a is gravity plus std times the output plus mean. With IMAGE the output is that of an image by the
+    scenes' `sign` [S, 3]. If the status is not zero, nothing changes.
     `lost` counts the coordinates of particles that are not finite or farther from the domain than its own size. If
     there are any, `advance` ends the simulation. All others stay between the walls of the first WALLED_AXES axes,
     `near` and `far` from the planes. With SURFACES particles also stay outside the obstacles of `barrier_table`
@@ -247,6 +250,8 @@ def integrate(
     a = tl.load(output + row[:, None] * OUT + axis, mask=live_axis, other=0.0)
     a = a * tl.load(std + axis) + tl.load(mean + axis)
     scene = tl.load(scene_of + row, mask=row < count, other=0)
+    if IMAGE:
+        a *= tl.load(sign + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
     a += tl.load(gravity + scene[:, None] * 3 + axis, mask=live_axis, other=0.0)
     v = tl.where(newest, v + a, v)
     before = tl.load(position + entry, mask=live_axis, other=0.0)
@@ -296,11 +301,13 @@ def integrate(
 
 @triton.jit
 def advance(
-    status, lost, frame, frame_of, origin, scenes, origin_range, DIMENSIONS: tl.constexpr, OVERLAP: tl.constexpr
+    status, lost, frame, frame_of, origin, scenes, origin_range, sign, gravity, image_gravity,
+    DIMENSIONS: tl.constexpr, IMAGES: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
     """Increments the frame if it was integrated, and sets the status to DIVERGED if coordinates were lost.
 
-    It then also increments the frames `frame_of` of all scenes, int64, and writes the origins of their next grids.
+    It then also increments the frames `frame_of` of all scenes, int64, and writes the origins of their next grids, and
+    with IMAGES, a number, the signs and gravities of their next images.
 
     Rule: hgn.runtime.torch_stepper and hgn.network.origins; test: tests/kernels/test_origins.py.
     """
@@ -317,6 +324,14 @@ def advance(
                 step = (X_STEP, Y_STEP, Z_STEP)[axis]
                 fraction = ((number * step & 0xFFFFFFFF) >> DROPPED_BITS).to(tl.float32) * FRACTION_UNIT
                 tl.store(origin + scene * 3 + axis, fraction * -origin_range, mask=there)
+                if IMAGES > 0:
+                    factor = fraction * 0 + 1
+                    for i in tl.static_range(IMAGES):
+                        if MIRRORS >> 3 * i + axis & 1:
+                            factor = tl.where(number % IMAGES == i, -1.0, factor)
+                    own = tl.load(gravity + scene * 3 + axis, mask=there, other=0.0)
+                    tl.store(sign + scene * 3 + axis, factor, mask=there)
+                    tl.store(image_gravity + scene * 3 + axis, factor * own, mask=there)
         if tl.load(lost) > 0:
             tl.store(status, DIVERGED)
 

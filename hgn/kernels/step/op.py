@@ -17,6 +17,7 @@ from hgn.kernels.moving import MovingTable, arguments_of
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step import kernel
 from hgn.kernels.triton_compat import overlaps
+from hgn.network.images import IMAGES
 from hgn.step.reference import LEAST_CREASE, LEVEL_SHIFT, REST_SIZES, SLACK, SURFACES, rests_widely
 from hgn.step_config import StepConfig
 
@@ -109,6 +110,8 @@ class DeviceStep:
         """Moves particles by the result of `rest`, stops them at walls and obstacles, and increments the frames.
         `normaliser` is the mean and standard deviation of accelerations."""
         step, config, status, overlap = self.step, self.config, self.grid.status, overlaps()
+        image, gravity_S3 = particles.image, particles.gravity_S3
+        sign_S3 = gravity_S3 if image is None else image.sign_S3
         near, far = step.wall_clearance or (0.0, 0.0)
         clearance = step.obstacle_clearance or 0.0
         kernel.integrate[(triton.cdiv(self.grid.particles, INTEGRATE_BLOCK),)](
@@ -121,11 +124,12 @@ class DeviceStep:
             HISTORY=config.velocity_history, COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
             WALLED_AXES=0 if step.wall_clearance is None else config.dimensions,
             SURFACES=0 if self.barriers is None else SURFACES, **arguments_of(moving, particles.count),
-            MOVING=0 if moving is None or self.barriers is None else moving.layers, OVERLAP=overlap,
-            BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
+            MOVING=0 if moving is None or self.barriers is None else moving.layers, sign=sign_S3,
+            IMAGE=image is not None, OVERLAP=overlap, BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
         kernel.advance[(1,)](
             status=status, lost=lost, frame=frame, frame_of=particles.frame_S, origin=particles.origin_S3,
-            scenes=len(particles.frame_S), origin_range=self.origin_range, DIMENSIONS=config.dimensions,
-            OVERLAP=overlap, num_warps=1, launch_pdl=overlap,
+            scenes=len(particles.frame_S), origin_range=self.origin_range, sign=sign_S3, gravity=gravity_S3,
+            image_gravity=(image or particles).gravity_S3, DIMENSIONS=config.dimensions,
+            IMAGES=0 if image is None else len(IMAGES), OVERLAP=overlap, num_warps=1, launch_pdl=overlap,
         )  # fmt: skip

@@ -5,6 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import triton.language as tl
+from kernels.engines import device
+from kernels.test_origins import BACKENDS
 from kernels.test_pushforward import let_move, with_parameters
 from network.states import network_of
 from training.test_symmetry import ALL_48, doubled, scene_with_obstacles
@@ -17,6 +20,7 @@ from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.training.symmetry import under_symmetries
 
 OWN = {"inputs": "local", "own_physics": ("friction", "parameters", "elastic", "moving"), "materials": MATERIALS}
+pytestmark = pytest.mark.usefixtures("large_tiles")
 NODES = 1 / 64, 2 / 64  # the walls' planes, whose images are those of the solver's nodes
 
 
@@ -53,14 +57,17 @@ def test_a_frame_is_predicted_in_the_image_that_training_shows(distance, monkeyp
     assert (changed_S > 1e-5).tolist() == (sign_S3 < 0).any(1).tolist(), changed_S
 
 
-@pytest.mark.parametrize("backend", ["torch", "cpu"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_an_image_moves_as_the_image_of_the_scene(backend, monkeypatch):
     """If scene and image begin at frames with opposite images, and all frames have the same origin, the image moves as
     the scene, mirrored. With the same images they move differently."""
-    monkeypatch.setattr("hgn.network.hgn.frame_origin", lambda frame_S, *_: torch.zeros(len(frame_S), 3))
+    monkeypatch.setattr("hgn.network.origins.STEPS", (0, 0, 0))
+    for axis in "XYZ":
+        monkeypatch.setattr(f"hgn.kernels.step.kernel.{axis}_STEP", tl.constexpr(0))
     network = network_of(torch.float32, **OWN, obstacle_distance=True, wall_clearance=NODES)
     network.normaliser.acceleration_std.fill_(0.01)
-    simulator, (state, image) = Simulator(network, 60.0, backend, "fp32"), states(network, IMAGES[1:] * 2)
+    state, image = states(network, IMAGES[1:] * 2)
+    simulator = Simulator(network.to(device()), 60.0, backend, "fp32")
     paths, sign_3, first_S = [], torch.tensor(IMAGES[1]), torch.tensor([0, 7])
     for start, frame_S in ((state, first_S), (image, first_S + 1), (image, first_S)):
         with simulator.simulation(replace(start, frame_S=frame_S)) as simulation:
@@ -69,3 +76,17 @@ def test_an_image_moves_as_the_image_of_the_scene(backend, monkeypatch):
     mirrored_TN3 = (sign_3 * torch.from_numpy(paths[0]) + shift_3).numpy()
     np.testing.assert_allclose(paths[1], mirrored_TN3, rtol=0, atol=2e-5)
     assert np.abs(paths[2] - mirrored_TN3).max() > 1e-3
+
+
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+def test_backends_show_the_same_images(backend, monkeypatch):
+    """Scenes at frames of their own, with moving obstacles, friction, parameters and elastic bodies, move as on torch,
+    and the check of the first output passes in an image."""
+    network = network_of(torch.float32, **OWN, obstacle_distance=True, wall_clearance=NODES, obstacle_clearance=5e-4)
+    network.normaliser.acceleration_std.fill_(0.01)
+    state, _ = states(network, [IMAGES[0]] * 4, monkeypatch)
+    state, paths = replace(state, frame_S=torch.tensor([0, 1, 7, 10])), []
+    for name in (backend, "torch"):
+        with Simulator(network.to(device()), 60.0, name, "fp32").simulation(state) as simulation:
+            paths.append(simulation.run(3))
+    np.testing.assert_allclose(paths[0], paths[1], rtol=0, atol=2e-5)
