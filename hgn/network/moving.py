@@ -79,7 +79,9 @@ class Poses:
         sign_V3 = sign_V3.to(self.place_V3)
         rotation_V33 = sign_V3[:, :, None] * self.rotation_V33
         change_V33 = sign_V3[:, :, None] * self.change_V33 * sign_V3[:, None]
-        return Poses(rotation_V33, self.pivot_V3, sign_V3 * self.place_V3 + shift_V3, change_V33, sign_V3 * self.shift_V3)
+        return Poses(
+            rotation_V33, self.pivot_V3, sign_V3 * self.place_V3 + shift_V3, change_V33, sign_V3 * self.shift_V3
+        )
 
     def undo(self, position_V3: torch.Tensor) -> torch.Tensor:
         """Moves a point of each row to the coordinates of the row's cells."""

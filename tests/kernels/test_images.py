@@ -43,8 +43,10 @@ def states(network, signs, move=None):
 
 @pytest.mark.parametrize("distance", [False, True])
 def test_a_frame_is_predicted_in_the_image_that_training_shows(distance, monkeypatch):
-    """Each scene of a batch, at a frame of its own, has the accelerations of its image with the frame's origin, mirrored
-    back. The images are those of training. Frame 0 is not mirrored, and a given origin neither."""
+    """Each scene of a batch, at a frame of its own, has the accelerations of its image with the frame's origin,
+    mirrored back. The images are those of training. Horizontal signs cancel over the images. Frame 0 is not mirrored,
+    and a given origin neither."""
+    assert np.sum(IMAGES, 0).tolist() == [0, len(IMAGES), 0]
     network = network_of(**OWN, obstacle_distance=distance, wall_clearance=NODES)
     frame_S = torch.tensor([0, 1, 7, 10])
     sign_S3 = torch.tensor([IMAGES[k % len(IMAGES)] for k in frame_S]).double()

@@ -83,7 +83,8 @@ def test_the_kernel_has_the_bits_of_the_reference(cell_size, dimensions):
         found_S, origin_S3 = frame_S.clone(), torch.zeros(len(frame_S), 3, device=device())
         advance[(1,)](
             *numbers, frame_of=found_S, origin=origin_S3, scenes=len(frame_S), origin_range=cell_size,
-            sign=origin_S3, gravity=origin_S3, image_gravity=origin_S3, DIMENSIONS=dimensions, IMAGES=0, OVERLAP=False, num_warps=1,
+            sign=origin_S3, gravity=origin_S3, image_gravity=origin_S3, DIMENSIONS=dimensions, IMAGES=0,
+            OVERLAP=False, num_warps=1,
         )  # fmt: skip
         assert torch.equal(found_S, frame_S + (status == 0)) and int(numbers[2]) == 5 + (status == 0)
         if status:
