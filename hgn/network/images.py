@@ -42,17 +42,18 @@ class Image:
 
     def shown(self, state: ParticleState) -> ParticleState:
         """Returns the image of a state. Its barriers are those of the scene."""
-        sign_N3, moving, poses = self.sign_S3[state.scene_N], state.moving, None
+        sign_N3, moving = self.sign_S3[state.scene_N], state.moving
         if moving is not None:
             rows = moving.layers, 1
             poses = moving.poses.mirrored(self.sign_S3.repeat(rows), self.shift_S3.repeat(rows))
+            moving = replace(moving, poses=poses)
         return replace(
             state,
             position_N3=self.places(state.position_N3, state.scene_N),
             velocity_NM3=sign_N3[:, None] * state.velocity_NM3,
             gravity_S3=self.sign_S3 * state.gravity_S3,
-            obstacles=state.obstacles and ImageCells.of(state.obstacles, self),
-            moving=moving and replace(moving, poses=poses),
+            obstacles=state.obstacles and ImageCells.seen(state.obstacles, self),
+            moving=moving,
         )
 
 
@@ -64,7 +65,7 @@ class ImageCells(ObstacleCells):
     image: Image
 
     @staticmethod
-    def of(cells: ObstacleCells, image: Image) -> ImageCells:
+    def seen(cells: ObstacleCells, image: Image) -> ImageCells:
         own = cells.key_K, cells.normal_K3, cells.cell_size, cells, image
         return ImageCells(*own, friction_K=cells.friction_K, distance_K=cells.distance_K)
 

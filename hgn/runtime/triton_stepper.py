@@ -127,9 +127,9 @@ class TritonStepper:
         )
         if network.images:
             near, far = network.step.wall_clearance or (0.0, 0.0)
-            names = ("domain_S3", "gravity_S3", "position_N3", "velocity_NV")
-            copies = (torch.zeros_like(getattr(self.buffers, name)) for name in names)
-            self.buffers = replace(self.buffers, image=DeviceImage(*copies, near - far))
+            same = self.buffers
+            copies = map(torch.zeros_like, (same.domain_S3, same.gravity_S3, same.position_N3, same.velocity_NV))
+            self.buffers = replace(same, image=DeviceImage(near - far, *copies))
         self.lost, self.frame = (torch.zeros(1, dtype=torch.int32, device=self.device) for _ in range(2))
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:

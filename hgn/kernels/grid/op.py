@@ -81,11 +81,11 @@ def feature_columns(config: NetworkConfig) -> int:
 class DeviceImage:
     """Holds the image of the particles that the network sees in this frame (hgn.network.images)."""
 
+    fold: float  # near - far of hgn.network.images
     sign_S3: torch.Tensor
     gravity_S3: torch.Tensor
     position_N3: torch.Tensor  # those of the image, written at the beginning of a frame
     velocity_NV: torch.Tensor
-    fold: float  # near - far of hgn.network.images
 
 
 @dataclass(frozen=True, eq=False)
