@@ -97,7 +97,7 @@ def _predicted(
         decoded.append(network.propagate(particle_NW, grid))
         return decoded[0]
 
-    prediction = network.predicted(state, network.grid(state, origin_S3), propagate)
+    prediction = network.predicted(state, origin_S3, propagate)
     return prediction.acceleration_N3, decoded[0]
 
 
