@@ -434,6 +434,9 @@ class TrainConfig:
         sees, remedy = self.network.obstacle_features, "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0"
         rule = "true for scenes with obstacles"
         require(sees or self.scene.obstacle_count == 0, "network.obstacle_features", rule, False, remedy)
+        mirrors, symmetry = self.network.relative and not self.step.rests, self.training.symmetry
+        rule = "gravity with relative inputs and step.rest_threshold=0, which simulate mirrored frames"
+        require(symmetry == "gravity" or not mirrors, "training.symmetry", rule, symmetry)
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} if training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)

@@ -58,6 +58,7 @@ RULES = {
         ({"obstacle_clearance": float("nan")}, "obstacle_clearance must be a finite number > 0, got nan"),
     ],
     step_of: [
+        ({"inputs": "relative"}, "training.symmetry must be gravity with relative inputs .*, got 'none'"),
         ({"rest_threshold": 0.3}, "step.rest_threshold must be 0 with inputs=absolute, got 0.3"),
         (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "step.rest_threshold must be 0 with dimensions=2"),
         ({"obstacle_clearance": 1e-3, "dimensions": 2}, "step.obstacle_clearance must be null with dimensions=2"),
