@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_111,
+    "hgn": 35_306,
     "datagen": 8_964,
     "tools": 6_296,
-    "tests": 36_916,
+    "tests": 37_012,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

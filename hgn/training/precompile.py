@@ -49,6 +49,7 @@ def launches_of(
     with noted_launches() as launches:
         with torch.device(device):
             network = HierarchicalGraphNetwork(config.network)
+        network.step = config.step
         sums, counters = torch.zeros(2, device=device), torch.zeros(5, device=device)
         reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if several_ranks else None
         cell_size, precision = config.scene.cell_size, training.precision

@@ -34,9 +34,9 @@ LOSS_SCALE = {"fp16": 256.0}
 ROOM = 2048 if NATIVE else 64  # for cells on each level
 
 # Without products, in integers, float32 or float64 at every precision: of grids and neighbours, batches, optimisers,
-# frames. Compared in test_network, test_update, test_training and test_rollout.
+# frames. Compared in test_network, test_images, test_update, test_training and test_rollout.
 ELSEWHERE = {
-    *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
+    *("show_image", "mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
     *("sum_motion", "deform", "prepare_relative_features"),
     *("sum_coarsest", "balance", "balance_backward", "add_coarsest"),
     *("sum_displacements", "find_deformation", "slow_displacements", "stop_slow"),

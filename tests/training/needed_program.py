@@ -53,7 +53,7 @@ training = replace(training, pushforward_fraction=0.5, pushforward_scenes=3)
 for own in (OWN[:0], OWN[:1], OWN[:2], OWN[:3], OWN):
     network = NetworkConfig("hgn", inputs="local", obstacle_distance=True, own_physics=own, materials=MATERIALS)
     network = replace(network, width=16, levels=2, message_passing_steps=1)
-    step = StepConfig(0.3, (0.02, 0.04), 1e-3)
+    step = StepConfig(0.0 if own else 0.3, (0.02, 0.04), 1e-3)
     config = TrainConfig(SceneConfig(own_physics=own), network=network, training=training, step=step)
     ahead = launches_of(config, False, (80, (400, 200)))
     for moves in (False, True)[: 1 + ("moving" in own)]:
