@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_306,
     "datagen": 8_964,
     "tools": 6_296,
-    "tests": 37_012,
+    "tests": 37_018,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -9,7 +9,7 @@ import triton.language as tl
 from kernels.engines import device
 from kernels.test_origins import BACKENDS
 from kernels.test_pushforward import let_move, with_parameters
-from network.states import network_of
+from network.states import network_of, on_device
 from training.test_symmetry import ALL_48, doubled, scene_with_obstacles
 
 from hgn.data.batch import make_batch
@@ -72,7 +72,7 @@ def test_an_image_moves_as_the_image_of_the_scene(backend, monkeypatch):
     simulator = Simulator(network.to(device()), 60.0, backend, "fp32")
     paths, sign_3, first_S = [], torch.tensor(IMAGES[1]), torch.tensor([0, 7])
     for start, frame_S in ((state, first_S), (image, first_S + 1), (image, first_S)):
-        with simulator.simulation(replace(start, frame_S=frame_S)) as simulation:
+        with simulator.simulation(on_device(replace(start, frame_S=frame_S), device())) as simulation:
             paths.append(simulation.run(4))
     shift_3 = (sign_3 < 0) * (1 - 1 / 64)
     mirrored_TN3 = (sign_3 * torch.from_numpy(paths[0]) + shift_3).numpy()
@@ -87,7 +87,7 @@ def test_backends_show_the_same_images(backend, monkeypatch):
     network = network_of(torch.float32, **OWN, obstacle_distance=True, wall_clearance=NODES, obstacle_clearance=5e-4)
     network.normaliser.acceleration_std.fill_(0.01)
     state, _ = states(network, [IMAGES[0]] * 4, monkeypatch)
-    state, paths = replace(state, frame_S=torch.tensor([0, 1, 7, 10])), []
+    state, paths = on_device(replace(state, frame_S=torch.tensor([0, 1, 7, 10])), device()), []
     for name in (backend, "torch"):
         with Simulator(network.to(device()), 60.0, name, "fp32").simulation(state) as simulation:
             paths.append(simulation.run(3))

@@ -20,6 +20,7 @@ from hgn.runtime.triton_stepper import TritonStepper
 from hgn.step.reference import accelerations, advanced
 
 BACKENDS = ("torch", "cpu", "triton") if device().type == "cpu" else ("torch", "triton")
+SAME = 0 if device().type == "cpu" else 2e-6  # on a GPU the order of sums changes
 ROOT = 1.22074408460575947536  # of x^4 = x + 1
 scene = partial(random_scene, domain_size=(0.4, 0.4, 0.4))
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -120,7 +121,7 @@ def test_the_rest_constraint_keeps_the_origin(backend):
     simulator = simulator_of(backend, rest_threshold=0.1)
     state = replace(simulator.start([scene(4)]), frame_S=torch.tensor([7], device=device()))
     still_TN3, moving_TN3 = (expected_path(simulator.network, state, 2, moving) for moving in (False, True))
-    assert np.array_equal(still_TN3, moving_TN3)
+    np.testing.assert_allclose(still_TN3, moving_TN3, rtol=0, atol=SAME)
     with simulator.simulation(state) as simulation:
         np.testing.assert_allclose(simulation.run(2), still_TN3, rtol=0, atol=2e-6)
         if backend == "triton":
@@ -177,5 +178,6 @@ def test_one_step_on_data_has_the_origin_0():
     simulator = simulator_of("torch")
     state, zero_S3 = simulator.start([scene(4), scene(3)]), torch.zeros(2, 3, device=device())
     outputs = [simulator.network.prediction(state, origin).acceleration_N3 for origin in (None, zero_S3)]
-    assert state.frame_S.tolist() == [0, 0] and torch.equal(*outputs)
+    assert state.frame_S.tolist() == [0, 0]
+    torch.testing.assert_close(*outputs, rtol=0, atol=10 * SAME)
     assert simulator.step(simulator.step(state)).frame_S.tolist() == [2, 2]

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kernels.engines import device
 from training.runs import metrics, train_mapping
 from training.test_weights import data as data
 
 from hgn import train
 from hgn.config import TrainingConfig
 from hgn.kernels.update.op import Updates
+from hgn.runtime.parity import relative_error
 from hgn.schema import ConfigError
 from hgn.training import parity, schedule
 from hgn.training.checkpoint import read_checkpoint
@@ -132,7 +134,9 @@ def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys, 
     assert errors.count("got fp16: its outputs differ") == 1 and "precision=auto trains in fp32" in errors
     assert ends[0]["hgn"] == ends[1]["hgn"] and ends[1]["hgn"]["precision"] == "fp32"
     for key, value in ends[0]["state_dict"].items():
-        assert torch.equal(ends[1]["state_dict"][key], value), key
+        found = ends[1]["state_dict"][key]
+        # on a GPU the order of sums changes
+        assert torch.equal(found, value) or (device().type == "cuda" and relative_error(found, value) < 1e-3), key
     refused = run_mapping(data, tmp_path / "refused", precision="fp16", **values)
     with pytest.raises(ConfigError, match=r"training\.precision must be tf32 on this machine, got fp16"):
         train.main(refused)
