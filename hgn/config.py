@@ -362,9 +362,6 @@ class TrainingConfig:
     noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
     # fraction of the noise's variance in waves of 4 to 64 cells, which neighbours have in common; the paper's is 0
     noise_correlated_fraction: Fraction[float] = 0.1
-    # acceleration, domain units per frame squared; squared errors of a frame with smaller rms acceleration a are
-    # multiplied by this / a, at most by 4; 0: all frames have equal loss weights
-    quiet_acceleration: NonNegative[float] = 0.0
     # fraction of an episode's samples drawn in proportion to their frames' acceleration, with loss weights that keep
     # the expected loss; 0: all frames are equally likely
     frame_importance: BelowOne[float] = 0.0
@@ -373,6 +370,8 @@ class TrainingConfig:
     more_data: tuple[str, ...] = ()
     # number of episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0
+    # weight of the errors of cells' means in the loss, on each level, beside errors of particles; 0: none
+    cell_mean_weight: NonNegative[float] = 0.0
     # gravity: samples are rotated and mirrored at random by the symmetries of gravity and domain; none: they are not
     symmetry: Annotated[str, one_of("none", "gravity")] = "none"
     # fraction of an update's samples from the network's own simulations, for example 0.25; 0: no simulations
@@ -431,12 +430,14 @@ class TrainConfig:
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
         rule = "relative if scene.kinds are given, or zero_gravity_fraction or tilted_gravity_fraction is above 0"
         require(self.network.relative or self.scene.upright, "network.inputs", rule, self.network.inputs)
-        sees, remedy = self.network.obstacle_features, "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0"
-        rule = "true for scenes with obstacles"
-        require(sees or self.scene.obstacle_count == 0, "network.obstacle_features", rule, False, remedy)
+        rule, remedy = "true for scenes with obstacles", "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0"
+        sees = self.network.obstacle_features or self.scene.obstacle_count == 0
+        require(sees, "network.obstacle_features", rule, False, remedy)
         mirrors, symmetry = self.network.relative and not self.step.rests, self.training.symmetry
         rule = "gravity with relative inputs and step.rest_threshold=0, which simulate mirrored frames"
         require(symmetry == "gravity" or not mirrors, "training.symmetry", rule, symmetry)
+        weight = self.training.cell_mean_weight if self.network.kind == "gns" else 0
+        require(weight == 0, "training.cell_mean_weight", "0 for gns, which has no cells", weight)
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} if training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)

@@ -25,6 +25,10 @@ def train_on_six_frames(frames=6, **training):
     return TrainConfig(dataset=dataset, network=NetworkConfig(), training=TrainingConfig(**training))
 
 
+def train_gns(**training):
+    return TrainConfig(network=NetworkConfig(**GNS), training=TrainingConfig(**training))
+
+
 def step_of(inputs="absolute", dimensions=3, **step):
     return TrainConfig(
         network=NetworkConfig(inputs=inputs, dimensions=dimensions), step=StepConfig(**step), imported=True
@@ -57,6 +61,7 @@ RULES = {
         ({"obstacle_clearance": 0.0}, "obstacle_clearance must be a finite number > 0, got 0.0"),
         ({"obstacle_clearance": float("nan")}, "obstacle_clearance must be a finite number > 0, got nan"),
     ],
+    train_gns: [({"cell_mean_weight": 2.0}, "training.cell_mean_weight must be 0 for gns, .*got 2.0")],
     step_of: [
         ({"inputs": "relative"}, "training.symmetry must be gravity with relative inputs .*, got 'none'"),
         ({"rest_threshold": 0.3}, "step.rest_threshold must be 0 with inputs=absolute, got 0.3"),

@@ -21,6 +21,20 @@ def split_slot(local, ny, nz, stride):
 
 
 @triton.jit
+def add_above(sums, parent, geometry, cell, there, LEVELS: tl.constexpr):
+    """Adds the values of finest cells to all cells above them, in `sums` [.., 4] of all levels."""
+    part = tl.arange(0, 4)[None, :]
+    value = tl.load(sums + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
+    for level in tl.static_range(1, LEVELS):
+        line = geometry + level * GEOMETRY_COLUMNS
+        # A parent past the capacity is -1.
+        cell = tl.load(parent + tl.load(line - GEOMETRY_COLUMNS + 6) + cell, mask=there, other=-1)
+        there = there & (cell >= 0)
+        at = sums + (tl.load(line + 6) + cell)[:, None] * 4 + part
+        tl.atomic_add(at, value, mask=there[:, None], sem="relaxed")
+
+
+@triton.jit
 def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
     """Writes to column `part` of `felt` [C, 2] the maximum of column `part` of `disturbed` [C, 2], divided by FULLY,
     over a coarsest cell and the cells across its faces."""

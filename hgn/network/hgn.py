@@ -99,7 +99,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
             return Prediction(image.sign_S3[state.scene_N] * shown.acceleration_N3, shown.contacts, shown.grid)
         grid = self.grid(state, origin_S3)
         if not self.config.relative:
-            return Prediction(propagate(self.encode_particles(state, grid), grid))
+            return Prediction(propagate(self.encode_particles(state, grid), grid), grid=grid)
         feature_NF, contacts = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state, contacts), grid)
         return Prediction(balanced(output_N9, contacts, grid), contacts, grid)

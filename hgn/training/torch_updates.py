@@ -10,6 +10,7 @@ from hgn.cpu.allocator import keep_freed_memory
 from hgn.data.batch import Batch, BatchSample, WindowChunk, join
 from hgn.network.base import ParticleNetwork
 from hgn.scene.episode import Episode
+from hgn.training.cell_means import with_means
 from hgn.training.gradients import GradientGuard
 from hgn.training.noise import jittered_origin, perturbed_window
 from hgn.training.pushforward import PushforwardPool
@@ -91,5 +92,10 @@ def batch_loss(network: ParticleNetwork, batch: Batch, training: TrainingConfig,
     window_WN3 = perturbed_window(batch, training.noise_std, correlated, cell_size=cell_size, dimensions=axes)
     origin_S3 = jittered_origin(batch, cell_size, axes) if jitter else None
     target_N3 = network.target(batch.acceleration(window_WN3), batch.gravity_S3[batch.scene_N])
-    predicted_N3 = network.normalised_acceleration(batch.state(window_WN3), origin_S3)
-    return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
+    prediction = network.prediction(batch.state(window_WN3), origin_S3)
+    error_N3 = prediction.acceleration_N3 - target_N3
+    weighted_N3 = error_N3
+    if training.cell_mean_weight > 0:
+        assert prediction.grid is not None
+        weighted_N3 = with_means(error_N3, prediction.grid, training.cell_mean_weight)
+    return batch.mean_over_scenes((error_N3 * weighted_N3).mean(-1))

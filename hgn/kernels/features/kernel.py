@@ -10,7 +10,7 @@ import triton.language as tl
 
 from hgn.kernels.blocks import with_column
 from hgn.kernels.bodies import one_over, three_columns
-from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around, raise_disturbed
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, add_above, most_around, raise_disturbed
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network import elastic
@@ -54,16 +54,7 @@ def sum_motion(
             tl.store(drift + cell * 8 + 5, y * inverse, mask=there)
             tl.store(drift + cell * 8 + 6, z * inverse, mask=there)
         return
-    there = cell < count
-    part = tl.arange(0, 4)[None, :]
-    value = tl.load(motion + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
-    for level in tl.static_range(1, LEVELS):
-        line = geometry + level * GEOMETRY_COLUMNS
-        # A parent past the capacity is -1.
-        cell = tl.load(parent + tl.load(line - GEOMETRY_COLUMNS + 6) + cell, mask=there, other=-1)
-        there = there & (cell >= 0)
-        at = motion + (tl.load(line + 6) + cell)[:, None] * 4 + part
-        tl.atomic_add(at, value, mask=there[:, None], sem="relaxed")
+    add_above(motion, parent, geometry, cell, cell < count, LEVELS)
 
 
 @triton.jit

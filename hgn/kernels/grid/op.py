@@ -193,7 +193,7 @@ class DeviceGrid:
         self.prefix_sum = integers(marks)
         self._owners = {"links": links, "table": table.view(torch.int64), "numbers": integers(entries)}
         self._owners["mask"] = max(0, entries - 1)
-        self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
+        self.slot_of_cell, self.parents, self._octant = integers(at), integers(at), integers(at)
         self._tables = integers(14 * at)
         self._neighbour, self._children = self._tables.split([6 * at, 8 * at])
         self.counts_L = integers(self.levels)
@@ -228,7 +228,7 @@ class DeviceGrid:
         return self._children[8 * at : 8 * (at + capacity)].view(8, capacity)
 
     def parent(self, level: int) -> torch.Tensor:
-        return self._parent[self._at[level] : self._at[level] + self.capacities[level]]
+        return self.parents[self._at[level] : self._at[level] + self.capacities[level]]
 
     def octant(self, level: int) -> torch.Tensor:
         return self._octant[self._at[level] : self._at[level] + self.capacities[level]]
@@ -260,7 +260,7 @@ class DeviceGrid:
             "LEVELS": self.levels, "BLOCK": FILL_BLOCK,
         }  # fmt: skip
         tables: dict[str, Any] = {
-            "slot_of_cell": self.slot_of_cell, "neighbour": self._neighbour, "parent": self._parent,
+            "slot_of_cell": self.slot_of_cell, "neighbour": self._neighbour, "parent": self.parents,
             "octant": self._octant, "children": self._children, "counts": self.counts_L, "needed": self.needed_L,
             "status": self.status, "OVERLAP": overlaps(),
         }  # fmt: skip
@@ -339,7 +339,7 @@ class DeviceGrid:
             )  # fmt: skip
             return
         feature_kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
-            motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
+            motion=self.motion_C4, parent=self.parents, geometry=self.geometry, counts=self.counts_L,
             disturbed=self.disturbed_C2, felt=self.felt_C2, neighbour=self.neighbour(self.levels - 1),
             drift=self.drift_C8, coarsest_capacity=self.capacities[-1], LEVELS=self.levels, MOVING=drift["MOVING"],
             OVERLAP=overlap, BLOCK=MARK_BLOCK, launch_pdl=overlap,
@@ -348,7 +348,7 @@ class DeviceGrid:
             velocity=seen.velocity_NV, scene_of=particles.scene_N, material_of=particles.material_N,
             gravity=seen.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
             weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, share_of=self.share_N8, motion=self.motion_C4,
-            parent=self._parent, geometry=self.geometry, features=self.feature_NF, touch_of=self.touch_N,
+            parent=self.parents, geometry=self.geometry, features=self.feature_NF, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, felt=self.felt_C2,
             parameter_of=self.touch_N if parameter_NP is None else parameter_NP, quiet=QUIET,
             HISTORY=config.velocity_history,

@@ -12,6 +12,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import nearest_tf32
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, add_above
 from hgn.kernels.obstacles import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 from hgn.network import elastic
@@ -185,14 +186,48 @@ def assemble_batch(
 
 
 @triton.jit
+def sum_errors(
+    output, target, cell_of, weight_of, particle_count, sums, OUT: tl.constexpr, BLOCK: tl.constexpr
+):  # fmt: skip
+    """Adds the particles' errors, and 1 in column 3, with the weights of their finest cells, to `sums` [C, 4].
+
+    Rule: hgn.training.cell_means; test: tests/kernels/test_cell_means.py.
+    """
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live, part, corner = row < count, tl.arange(0, 4)[None, :], tl.arange(0, 8)[None, :]
+    here = live[:, None] & (part < 3)
+    error = tl.load(output + row[:, None] * OUT + part, mask=here, other=1.0)
+    error -= tl.load(target + row[:, None] * 3 + part, mask=here, other=0.0)
+    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=live[:, None], other=0)
+    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=live[:, None], other=0.0)
+    at = sums + cell[:, :, None] * 4 + part[:, None, :]
+    tl.atomic_add(at, weight[:, :, None] * error[:, None, :], mask=(weight > 0)[:, :, None], sem="relaxed")
+
+
+@triton.jit
+def sum_errors_above(sums, parent, geometry, counts, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
+    """Adds the sums of the finest cells to all cells above them, in `sums` [.., 4] of all levels.
+
+    Rule: hgn.training.cell_means; test: tests/kernels/test_cell_means.py.
+    """
+    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    add_above(sums, parent, geometry, cell, cell < tl.load(counts), LEVELS)
+
+
+@triton.jit
 def loss_gradient(
-    output, target, share_of, particle_count, gradient, loss, scale, OUT: tl.constexpr, BLOCK: tl.constexpr
-):
+    output, target, share_of, particle_count, gradient, loss, scale, cell_of, weight_of, sums, parent, geometry,
+    cell_mean_weight, OUT: tl.constexpr, LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Computes the mean squared error of normalised accelerations over axes, particles and scenes, and its gradient.
 
-    The gradient is multiplied by `scale`.
+    The gradient is multiplied by `scale`. With LEVELS the errors of the cells' means in `sums` are added, with
+    `cell_mean_weight` (hgn.training.cell_means).
 
-    Rule: torch's autograd; test: tests/kernels/test_update.py.
+    Rule: torch's autograd; test: tests/kernels/test_update.py, tests/kernels/test_cell_means.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -204,8 +239,23 @@ def loss_gradient(
     error = tl.load(output + at, mask=live, other=0.0)
     error -= tl.load(target + row[:, None] * 3 + column[None, :], mask=live, other=0.0)
     share = tl.load(share_of + row, mask=row < count, other=0.0)[:, None] / 3
-    tl.store(gradient + at, 2 * scale * share * error, mask=(row < count)[:, None])
-    tl.atomic_add(loss, tl.sum(tl.sum(share * error * error, 1), 0))
+    weighted = error
+    for i in tl.static_range(8 if LEVELS > 0 else 0):
+        cell = tl.load(cell_of + row * 8 + i, mask=row < count, other=0)
+        weight = cell_mean_weight * tl.load(weight_of + row * 8 + i, mask=row < count, other=0.0)
+        there = (row < count) & (weight > 0)
+        for level in tl.static_range(LEVELS):
+            line = geometry + level * GEOMETRY_COLUMNS
+            first = tl.load(line + 6)
+            mean = sums + (first + cell) * 4
+            factor = weight / tl.load(mean + 3, mask=there, other=1.0)
+            weighted += factor[:, None] * tl.load(
+                mean[:, None] + column[None, :], mask=live & there[:, None], other=0.0
+            )
+            cell = tl.load(parent + first + cell, mask=there & (level < LEVELS - 1), other=-1)
+            there = there & (cell >= 0)
+    tl.store(gradient + at, 2 * scale * share * weighted, mask=(row < count)[:, None])
+    tl.atomic_add(loss, tl.sum(tl.sum(share * error * weighted, 1), 0))
 
 
 @triton.jit

@@ -34,7 +34,7 @@ from hgn.schema import ConfigError
 SAMPLE_COLUMNS = kernel.SAMPLE_COLUMNS.value
 GROWTH = 1.25
 TABLE_UPDATES = 64  # smallest capacity of the tables, in updates; a larger table needs a new capture of the graph
-BLOCK, FLAT_BLOCK = 128, 1024
+BLOCK, ERROR_BLOCK, FLAT_BLOCK = 128, 32, 1024
 TAIL = 16  # number of extra elements after the gradient; the first one reports an overflow to the other ranks
 
 
@@ -277,10 +277,17 @@ class Updates:
         self._grid()
         fused = self.fused
         fused.forward()
-        kernel.loss_gradient[(triton.cdiv(self.particles, BLOCK),)](
-            output=fused.output, target=self.target_N3, share_of=self.share_N,
-            particle_count=self.buffers.count, gradient=fused.output_gradient, loss=self.loss,
-            scale=1.0 / fused.unscale, OUT=fused.output.shape[1], BLOCK=BLOCK,
+        grid, levels, columns = self.grid, self.config.levels, fused.output.shape[1]
+        sums = {"sums": self.sum_C4, "cell_of": grid.cell_N8, "weight_of": grid.weight_N8}
+        above = {"parent": grid.parents, "geometry": grid.geometry, "LEVELS": levels if len(self.sum_C4) else 0}
+        errors = {"output": fused.output, "target": self.target_N3, "particle_count": self.buffers.count}
+        blocks, cells = (triton.cdiv(self.particles, ERROR_BLOCK),), (triton.cdiv(self.capacities[0], BLOCK),)
+        if len(self.sum_C4):
+            kernel.sum_errors[blocks](**errors, **sums, OUT=columns, BLOCK=ERROR_BLOCK)
+            kernel.sum_errors_above[cells](**above, sums=self.sum_C4, counts=grid.counts_L, BLOCK=BLOCK)
+        kernel.loss_gradient[blocks](
+            **errors, **sums, **above, share_of=self.share_N, gradient=fused.output_gradient, loss=self.loss,
+            scale=1.0 / fused.unscale, cell_mean_weight=self.training.cell_mean_weight, OUT=columns, BLOCK=ERROR_BLOCK,
         )  # fmt: skip
         fused.backward()
         if self.reduce is not None:
@@ -377,6 +384,8 @@ class Updates:
             self.grid.build(self.buffers)
             self.capacities = self._rounded(self.grid.needed_L.tolist())
         self.grid = self._device_grid(self.capacities)
+        sums = self.grid.more_cleared[0] if self.training.cell_mean_weight > 0 else torch.empty(0, device=device)
+        self.sum_C4 = sums.view(torch.float32).view(-1, 4)  # sums of errors in the cells of all levels
         # The gradients of a mean over particles are small. float16 would round them to zero without a scale.
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         self.fused = FusedTrainingNetwork(
@@ -386,7 +395,8 @@ class Updates:
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
         config, (lower, upper) = self.config, self._reach
         window = Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
-        return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device)
+        more = (4 * sum(capacities),) if self.training.cell_mean_weight > 0 else ()
+        return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device, more)
 
     def _make_room(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
