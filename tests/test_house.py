@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_385,
+    "hgn": 35_392,
     "datagen": 8_964,
     "tools": 6_296,
-    "tests": 37_059,
+    "tests": 37_102,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -42,8 +42,8 @@ def temporary_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Writes `data` to a temporary name in the same folder, syncs it and renames it to `path`.
+def write_atomically(path: Path, data: bytes, before: Callable[[], object] = lambda: None) -> None:
+    """Writes `data` to a temporary name in the same folder, syncs it, calls `before`, and renames it to `path`.
 
     Raises OSError (a full disk, no permission). It then leaves no new file, and an existing `path` is unchanged.
     """
@@ -51,6 +51,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         with temporary.open("wb") as file:
             file.write(data)
             sync_file(file)
+        before()
         temporary.replace(path)
     sync_folder(path.parent)
 

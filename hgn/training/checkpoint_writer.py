@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,9 @@ class CheckpointWriter(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Returns when the checkpoint is copied. Raises: OSError if the previous write failed."""
         self.wait()
-        copy, place = snapshot(checkpoint), Path(path)
-        self._writing = self._thread.submit(outlived, lambda: _write(copy, place, self._earlier), place)
+        place = Path(path)
+        write = partial(_write, snapshot(checkpoint), place, earlier=self._earlier, rotated=[])
+        self._writing = self._thread.submit(outlived, write, place)
 
     def load_checkpoint(self, path: Any, *given: Any, **options: Any) -> Any:
         return outlived(
@@ -116,16 +118,21 @@ def _require_none_later(checkpoint: dict[str, Any], folder: Path, earlier: set[t
                 earlier.add(identity)
 
 
-def _write(checkpoint: dict[str, Any], path: Path, earlier: set[tuple[int, int]]) -> None:
+def _write(checkpoint: dict[str, Any], path: Path, earlier: set[tuple[int, int]], rotated: list[Path]) -> None:
+    """Writes a checkpoint. A repeated call with the same `rotated` completes it, and keeps the same earlier ones."""
     make_again(path.parent.parent)
     make_folder(path.parent)
     _require_none_later(checkpoint, path.parent, earlier)
     content = io.BytesIO()
     with _short_turns():
         torch.save(checkpoint, content)
-    if path.name == LAST_NAMES[0]:
-        _keep_earlier(path.parent)
-    write_atomically(path, content.getvalue())
+
+    def rotate() -> None:
+        if path.name == LAST_NAMES[0] and not rotated:
+            _keep_earlier(path.parent)
+            rotated.append(path)
+
+    write_atomically(path, content.getvalue(), rotate)
     if path.name == LAST_NAMES[0]:
         earlier.add(_identity(path))
         (path.parent.parent / SAVED).touch()

@@ -1,7 +1,11 @@
 """Tests checkpoints that are written during updates: their content, and the handling of faults."""
 
+import errno
+import os
 import signal
 import threading
+from contextlib import nullcontext, suppress
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +15,7 @@ from hgn import train
 from hgn.system.files import write_atomically
 from hgn.system.patience import VARIABLE
 from hgn.training import checkpoint_writer
-from hgn.training.checkpoint import read_checkpoint
+from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.torch_updates import TorchUpdates
 
@@ -31,10 +35,10 @@ class Gate:
         self.events: list[str] = []
         monkeypatch.setattr(checkpoint_writer, "write_atomically", self.write)
 
-    def write(self, path, content):
+    def write(self, path, *rest):
         self.events.append(f"begin {path.name}")
         assert self.opened.wait(60)
-        write_atomically(path, content)
+        write_atomically(path, *rest)
         self.events.append(f"end {path.name}")
 
 
@@ -98,16 +102,55 @@ def test_a_failed_write_is_raised(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["folder.ckpt"]
 
 
+@pytest.mark.parametrize(
+    ("place", "name", "passing", "failing"),
+    [
+        *((Path, "open", 0, times) for times in (3, 100)),
+        *((os, "fsync", 0, times) for times in (3, 100)),
+        (os, "fsync", 1, 3),  # of the folder
+        (Path, "replace", 2, 3),  # after the renames of the older ones
+        (Path, "touch", 0, 3),
+    ],
+)
+def test_a_failed_write_loses_no_older_checkpoint(writer, tmp_path, monkeypatch, place, name, passing, failing):
+    """Retries of a write replace one checkpoint by the new one, whichever step fails. A write that is given up
+    replaces none."""
+
+    def save(update):
+        section = {"updates": update, "sampler_state": {}}
+        writer.save_checkpoint({"state_dict": {}, "hgn": section}, tmp_path / "checkpoints" / "last.ckpt")
+        writer.wait()
+
+    def stored():
+        return [read_checkpoint(tmp_path / "checkpoints" / name)["hgn"]["updates"] for name in LAST_NAMES]
+
+    for update in (1, 2, 3):
+        save(update)
+    function, calls = getattr(place, name), []
+
+    def step(*given, **named):
+        calls.append(given)
+        if passing < len(calls) <= passing + failing:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return function(*given, **named)
+
+    monkeypatch.setenv(VARIABLE, "3" if failing == 3 else "0")
+    with monkeypatch.context() as patch, suppress(OSError) if failing == 100 else nullcontext():
+        patch.setattr(place, name, step)
+        save(4)
+    assert stored() == ([4, 3, 2] if failing == 3 else [3, 2, 1])
+
+
 @pytest.mark.parametrize("failing", ["best.ckpt", "last.ckpt"])
 def test_a_training_ends_when_it_cannot_write(finished, monkeypatch, failing):
     """A full disk ends the training with the file's name, and leaves the last checkpoint that could be written."""
     data, run = finished
     kept = (run / "checkpoints" / "last.ckpt").read_bytes()
 
-    def write(path, content):
+    def write(path, *rest):
         if path.name == failing:
             raise OSError(28, "No space left on device", str(path))
-        write_atomically(path, content)
+        write_atomically(path, *rest)
 
     monkeypatch.setenv(VARIABLE, "0")
     monkeypatch.setattr(checkpoint_writer, "write_atomically", write)
