@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_392,
+    "hgn": 35_394,
     "datagen": 8_964,
     "tools": 6_296,
     "tests": 37_102,

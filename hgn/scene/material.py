@@ -73,6 +73,7 @@ MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # names of an imported set'
 
 def require_materials(owner: str, material_N: np.ndarray, materials: Sequence[str]) -> None:
     """Raises ConfigError unless field `owner` contains indices into `materials`, and these are valid names."""
+    require(isinstance(materials, (tuple, list)), f"{owner}: materials", "a list of names", materials)
     for name in materials:
         if MATERIAL_NAME.fullmatch(name) is None:
             raise ConfigError(f"{owner}: materials must be names of lower-case letters, digits and _, got {name!r}")

@@ -401,7 +401,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
     with np.errstate(over="ignore"):  # infinite positions of particles are refused
         position_TP3[shown_TP] = points[()]
-    source = strict_json(own["source"][()])
+    source, materials = strict_json(own["source"][()]), strict_json(own.attrs["materials"])
     require(isinstance(source, dict), "source", "a mapping", source)
     rollout = Rollout(
         position_TN3=position_TP3[:, vertices:],
@@ -414,7 +414,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
         source=source,
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
-        materials=tuple(json.loads(own.attrs["materials"])),
+        materials=tuple(materials) if isinstance(materials, list) else materials,
         dimensions=np.asarray(own.attrs["dimensions"]).item(),
     )
     for name, array in (("Points", rollout.position_TN3), ("reference", rollout.reference_TN3)):
