@@ -20,7 +20,7 @@ from tools.stability import network, parameters
 from tools.stability.network import Runner, main
 from tools.stability.parameters import AVERAGED, DRAWS, SLOPE_DEG
 
-RESULTS = Path(__file__).parents[2] / "results" / "stability" / "parameters_origins_cpu.json"
+RESULTS = Path(__file__).parents[2] / "results" / "stability" / "parameters_images_cpu.json"
 KINDS = ("run-out of sand", "spread of water", "sag of an elastic block", "slide on 20 degrees")
 FREE = [f"{label}, friction 0 (edge)" for label in (KINDS[3], "slide near the floor")]
 RULES = {  # parameter, constant and default of a made-up solver: its figures are constant / parameter
