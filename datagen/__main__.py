@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Runs the generator on a composed config. The exit code is 0, or 128 + the signal that stopped it."""
-    from datagen.generate import StopSignal, datagen_config, generate
+    from datagen.generate import datagen_config, generate, stop_signals
     from datagen.pool.progress import make_progress
 
     kind = mapping.get("progress", "bar")
     progress = make_progress(kind)
     config = datagen_config(mapping)
-    with StopSignal() as stop:
+    with stop_signals() as stop:
         # a training that waits for the first episodes reads progress=json
-        finished = generate(config, progress, stop.requested, backend, early=kind == "json")
-    return 0 if finished else 128 + (stop.signal or 0)
+        finished = generate(config, progress, lambda: stop.requested, backend, early=kind == "json")
+    return 0 if finished else stop.exit_code
 
 
 if __name__ == "__main__":

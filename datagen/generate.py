@@ -4,7 +4,6 @@ import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from types import FrameType
 from typing import Any
 
 from datagen.pool.local_workers import LocalWorkerFactory
@@ -17,6 +16,7 @@ from hgn.config import DatagenConfig
 from hgn.data.fresh import draw_fresh
 from hgn.schema import ConfigError, from_mapping, known_keys, require
 from hgn.system.machine import available_cpus, available_memory
+from hgn.system.signals import Signals
 
 _SECTIONS = ("scene", "mpm", "dataset")
 # keys of the command that belong to the section `dataset`, with their names there
@@ -31,29 +31,9 @@ _OF_DATASET = {
 _OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
 
-class StopSignal:
-    """Records the first Ctrl-C or SIGTERM, so that current writes are finished. A second one ends the process."""
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-
-    def __enter__(self) -> "StopSignal":
-        self._previous = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._restore()
-
-    def requested(self) -> bool:
-        return self.signal is not None
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.signal = number
-        self._restore()
-
-    def _restore(self) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+def stop_signals() -> Signals:
+    """Returns a record of Ctrl-C and SIGTERM, so that current writes are finished."""
+    return Signals(numbers=(signal.SIGINT, signal.SIGTERM))
 
 
 def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> DatagenConfig:

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.generate import StopSignal
+from datagen.generate import stop_signals
 from hgn.command import run_command
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.storage import is_remote, open_storage, remote_storage
 from hgn.schema import ConfigError, from_mapping, printable, require
 from hgn.system.progress import bar
+from hgn.system.signals import Signals
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,13 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(UploadConfig, mapping)
     require(is_remote(config.to), "to", "a URL", config.to, "as in to=s3://bucket/obstacles")
     require(not is_remote(config.data), "data", "a local folder", config.data)
-    with StopSignal() as stop:
+    with stop_signals() as stop:
         copy = upload(Path(config.data), config.to.rstrip("/"), stop)
     print(printable(f"{config.to} has {len(copy.shards)} shards") + (", the whole data set" if copy.complete else ""))
-    return 0 if stop.signal is None else 128 + stop.signal
+    return stop.exit_code
 
 
-def upload(folder: Path, url: str, stop: StopSignal) -> Manifest:
+def upload(folder: Path, url: str, stop: Signals) -> Manifest:
     """Copies the missing shards, then the index and the manifest. After a stop request it copies no more.
 
     Returns the manifest at the URL, or an empty one. An object store writes files atomically.
@@ -62,7 +63,7 @@ def upload(folder: Path, url: str, stop: StopSignal) -> Manifest:
     size, before = (sum(total.bytes for total in each.totals.values()) for each in (manifest, there))
     with bar("copying", total=size - before, unit="byte") as progress:
         for shard in manifest.shards.since(len(there.shards)):
-            if stop.requested():
+            if stop.requested:
                 return there
             remote.write(shard.name, open_storage(folder).shard(shard.name, shard.sha256, shard.bytes))
             progress.update(shard.bytes)

@@ -13,19 +13,18 @@ import itertools
 import os
 import re
 import select
-import signal
 import stat
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn, cast
 
 from hgn.config import config_directory
 from hgn.schema import PATH_RULE, ConfigError, is_path, printable, require
 from hgn.system.extras import missing_extra
 from hgn.system.machine import memory_is_full
+from hgn.system.signals import Signals, interrupt
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 
@@ -75,10 +74,10 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     code: int | str | None
     try:
         try:
-            with _ended_as_by_ctrl_c() as received:
+            with Signals(interrupt) as signals:
                 code = _exit_code(main, config_name)
-            if code == EXIT_INTERRUPTED and received:  # a library raised another KeyboardInterrupt, without the number
-                code = 128 + received[0]
+            if code == EXIT_INTERRUPTED:  # perhaps a library raised another KeyboardInterrupt, without the number
+                code = signals.exit_code or code
         except SystemExit as end:  # Hydra ends the process after --help
             code = end.code
         sys.stdout.flush()
@@ -91,33 +90,6 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
     sys.exit(code)
-
-
-@contextmanager
-def _ended_as_by_ctrl_c() -> Iterator[list[int]]:
-    """Lets the first of SIGTERM and SIGHUP raise KeyboardInterrupt with its number. Ignored ones (nohup) stay ignored.
-
-    After a signal further ones are ignored, except Ctrl-C: terminals and services send several, and a command may still
-    write its results. Yields the list of received numbers.
-    """
-    received: list[int] = []
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        if len(received) == 1:
-            raise KeyboardInterrupt(number)
-
-    wanted = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-    numbers = [n for n in wanted if signal.getsignal(n) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            if signal.getsignal(number) is interrupt:  # a training's own handlers stay until the process ends
-                signal.signal(number, handler)
 
 
 class _Messages(io.FileIO):

@@ -37,7 +37,7 @@ class ServiceConfig(Bounded):
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Serves until it is stopped. The exit code is 128 + the signal."""
-    from datagen.generate import StopSignal, datagen_config, require_local_folder
+    from datagen.generate import datagen_config, require_local_folder, stop_signals
     from datagen.pool.progress import make_progress
     from datagen.service.health import HealthPage
     from datagen.service.log import UnhurriedLog
@@ -54,7 +54,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     if (folder / MANIFEST_NAME).exists():
         require_same_dataset(Manifest.load(folder).config, config, folder)
     token = dataset_token()
-    with ExitStack() as stack, StopSignal() as stop:
+    with ExitStack() as stack, stop_signals() as stop:
         listener = stack.enter_context(_listen(service.host, service.port, token))
         log = stack.enter_context(UnhurriedLog())
         page = None
@@ -83,7 +83,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
                 server.run(sockets=[listener])
         if supervisor.unusable is not None:
             raise ConfigError(supervisor.unusable)
-    return 128 + (stop.signal or 0)
+    return stop.exit_code
 
 
 def _listen(host: str, port: int, token: str | None) -> socket.socket:

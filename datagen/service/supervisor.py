@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from typing import Any
 
-from datagen.generate import StopSignal, generate
+from datagen.generate import generate, stop_signals
 from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, error_message
 from hgn.config import DatagenConfig
@@ -163,7 +163,7 @@ class _PipeProgress(Progress):
 
 
 def _generate(connection: Connection, config: DatagenConfig, backend: Backend | None) -> None:
-    with StopSignal() as stop:
+    with stop_signals() as stop:
         try:
             spoke_at = -_BEAT_S
 
@@ -172,7 +172,7 @@ def _generate(connection: Connection, config: DatagenConfig, backend: Backend | 
                 if time.monotonic() - spoke_at > _BEAT_S:  # the supervisor notices a suspended pool by missing reports
                     spoke_at = time.monotonic()
                     connection.send(("alive",))
-                return stop.requested()
+                return stop.requested
 
             finished = generate(config, _PipeProgress(connection), should_stop, backend, early=True)
             connection.send(("complete",) if finished else ("stopped",))

@@ -6,6 +6,7 @@ Shape legend: T frames, N particles, V vertices, F triangles.
 """
 
 import errno
+import itertools
 import os
 import shutil
 import tempfile
@@ -23,15 +24,13 @@ from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
 from hgn.scene.rollout_file import (
     Rollout,
-    Simulation,
     frame_velocity,
-    raise_interruption,
     rollout_bytes,
-    take_frames,
     write_frames,
     write_rollout,
 )
 from hgn.scene.scene import Obstacle
+from hgn.scene.simulated_frames import Simulation, simulated
 from hgn.schema import ConfigError, require_replaceable
 from hgn.system.extras import require_installed
 from hgn.system.files import WRITTEN_BY_HGN, space_reserved, sync_folder, sync_written
@@ -79,16 +78,25 @@ def save_rollout(
 def save_frames(path: Path, rollout: Rollout, simulate: Simulation, surface: bool = False) -> Path:
     """Writes frames as they are simulated, and stores them in `rollout.position_TN3`. Formats: see `save_rollout`.
 
-    USD and PLY are written after the last frame; after Ctrl-C they contain the frames so far.
+    USD and PLY are written after the last frame; after Ctrl-C they contain the frames so far. If a signal or an error
+    ends this writing, the frames are in a new VTKHDF file.
     """
     if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
         write_frames(path, rollout, simulate)
         return path
-    with space_reserved(path, rollout_bytes(rollout.frame_count, rollout.particle_count)):
-        count, interruption = take_frames(rollout, simulate)
-    written = save_rollout(path, replace(rollout, position_TN3=rollout.position_TN3[:count]), surface)
-    raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {written}")
-    return written
+    with simulated(rollout.position_TN3) as frames:
+        with space_reserved(path, rollout_bytes(rollout.frame_count, rollout.particle_count)):
+            frames.take(simulate)
+        shown = replace(rollout, position_TN3=rollout.position_TN3[: frames.count])
+        try:
+            frames.place = save_rollout(path, shown, surface, frames.end_if_interrupted)
+        except BaseException:
+            others = (path.with_name(f"{path.name}{number or ''}.vtkhdf") for number in itertools.count())
+            unused = next(other for other in others if not other.exists())
+            write_rollout(unused, shown)
+            frames.place = unused
+            raise
+    return frames.place
 
 
 def require_exchange(path: Path, surface: bool) -> None:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -31,10 +30,10 @@ from hgn.scene.hdf5 import FileOnDisk, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
+from hgn.scene.simulated_frames import Simulation, simulated
 from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds, strict_json, triple
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
-from hgn.system.processes import signals_delayed
 
 if TYPE_CHECKING:
     import h5py
@@ -52,7 +51,6 @@ FARTHEST = 1000  # largest coordinate of particles in a file, in domain sizes; a
 KINDS = {"VTKHDF/Points": "f", "VTKHDF/NumberOfPoints": "iu", "hgn/reference": "f", "hgn/entry_frame": "iu"}
 TRIANGLE_BYTES = 1000  # about the memory that a picture takes for a triangle
 FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
-Simulation = Callable[[Callable[[np.ndarray], None]], None]  # gives each frame to a function, float32 [present, 3]
 POINTS_OF_A_WRITE = 1_000_000  # points of the frames that are in memory together; each takes about 100 bytes
 
 
@@ -154,50 +152,18 @@ def write_frames(path: Path, rollout: Rollout, simulate: Simulation) -> None:
     Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
-    with contextlib.ExitStack() as end, space_reserved(path, size) as release, _growing_file(path, rollout) as file:
+    with simulated(rollout.position_TN3) as frames:
+        with space_reserved(path, size) as release, _growing_file(path, rollout) as file:
 
-        def append(count: int) -> None:
-            if time.monotonic() - file.written_s > WRITE_EVERY_S:
-                release(size * (count - file.count) // rollout.frame_count)
-                file.write(count)
+            def append() -> None:
+                if time.monotonic() - file.written_s > WRITE_EVERY_S:
+                    release(size * (frames.count - file.count) // rollout.frame_count)
+                    file.write(frames.count)
 
-        count, interruption = take_frames(rollout, simulate, append)
-        end.enter_context(signals_delayed())  # one of them would now lose all frames
-        release(size)
-        file.write(count)
-    raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {path}")
-
-
-def take_frames(
-    rollout: Rollout, simulate: Simulation, each: Callable[[int], None] = lambda _: None
-) -> tuple[int, BaseException | None]:
-    """Puts the frames of `simulate` into `rollout.position_TN3`, and calls `each` with their number so far.
-
-    Returns the number of frames, and the interruption (Ctrl-C, an error of the disk or a ConfigError) or None. An
-    interruption before the second frame is raised.
-    """
-    count = 0
-
-    def take(position_N3: np.ndarray) -> None:
-        nonlocal count
-        rollout.position_TN3[count, : len(position_N3)] = position_N3
-        count += 1
-        each(count)
-
-    try:
-        simulate(take)
-    except (KeyboardInterrupt, OSError, ConfigError) as error:
-        if count < 2:  # frame 0 is the initial state
-            raise
-        return count, error
-    return count, None
-
-
-def raise_interruption(interruption: BaseException | None, kept: str) -> None:
-    """Prints what was kept and raises the interruption, if there was one."""
-    if interruption is not None:
-        print(kept, file=sys.stderr)
-        raise interruption
+            frames.take(simulate, append)
+            release(size)
+            file.write(frames.count)
+        frames.place = path
 
 
 @contextlib.contextmanager

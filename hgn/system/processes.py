@@ -1,4 +1,4 @@
-"""Starts child processes that end with their parent, and delays signals."""
+"""Starts child processes that end with their parent."""
 
 import contextlib
 import ctypes
@@ -6,8 +6,7 @@ import multiprocessing
 import os
 import signal
 import subprocess
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -19,24 +18,6 @@ PR_SET_PDEATHSIG = 1  # from linux/prctl.h
 def die_with_parent(number: int) -> None:
     """Asks Linux, in a child process, to send it the signal `number` when its parent ends for any reason."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
-
-
-@contextlib.contextmanager
-def signals_delayed() -> Iterator[None]:
-    """Delays SIGINT, SIGTERM and SIGHUP to the end of short work, in the main thread. Ignored ones stay ignored."""
-    received: list[int] = []
-    main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if main else ()
-    before = {n: handler for n in numbers if (handler := signal.getsignal(n)) not in (signal.SIG_IGN, None)}
-    for number in before:
-        signal.signal(number, lambda number, _: received.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for first in received[:1]:
-            signal.raise_signal(first)
 
 
 class Program:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -163,13 +164,15 @@ def test_json_progress(command):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 def test_stopping_leaves_a_resumable_folder(control, command, tmp_path):
-    """Ctrl-C keeps every staged episode and leaves no process; the same command resumes. `kill -9` is what test_kills
-    is about."""
+    """Ctrl-C, which a launcher repeats, keeps every staged episode and leaves no process; the same command resumes.
+    `kill -9` is what test_kills is about."""
     (control / "slow").touch()
     process = start_module("ballistic_command", *SMALL, "out=made", cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     manifest = tmp_path / "made" / "manifest.json"
     wait_until(lambda: manifest.exists() and Manifest.load(manifest.parent).revision >= 1)
-    os.killpg(process.pid, signal.SIGINT)  # a terminal signals the whole group
+    for _ in range(2):
+        os.killpg(process.pid, signal.SIGINT)  # a terminal signals the whole group
+        time.sleep(0.02)
     _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     wait_until(lambda: not processes_of_session(process.pid))

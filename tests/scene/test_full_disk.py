@@ -12,6 +12,7 @@ from scene.test_rollout_file import contents, growing
 from hgn.scene import rollout_file
 from hgn.scene.hdf5 import FileOnDisk
 from hgn.scene.rollout_file import read_rollout, write_frames, write_rollout
+from hgn.scene.simulated_frames import SimulatedFrames
 
 
 @pytest.fixture
@@ -42,12 +43,12 @@ def test_refused_data(tmp_path, monkeypatch, request, refused, how, size, lastin
     without an error, or ended the process."""
     file_limit = request.getfixturevalue(how)
     monkeypatch.setattr(rollout_file, "WRITE_EVERY_S", -1.0)
-    whole, path, take_frames = growing(), tmp_path / "a.vtkhdf", rollout_file.take_frames
+    whole, path, take = growing(), tmp_path / "a.vtkhdf", SimulatedFrames.take
     write_rollout(path, dataclasses.replace(whole, position_TN3=whole.position_TN3[: refused + 1]))
     expected = contents(path)
     if not lasting:
         path.unlink()
-        monkeypatch.setattr(rollout_file, "take_frames", lambda *rest: (take_frames(*rest), file_limit(None))[0])
+        monkeypatch.setattr(SimulatedFrames, "take", lambda *rest: (take(*rest), file_limit(None)))
 
     def simulate(take):
         for frame, position_N3 in enumerate(whole.position_TN3):

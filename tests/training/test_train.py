@@ -4,6 +4,7 @@ import math
 import os
 import signal
 import zipfile
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import permutations
 
@@ -21,6 +22,7 @@ from hgn.data.manifest import Manifest
 from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
+from hgn.system import signals
 from hgn.system.locks import locked
 from hgn.training import callbacks, gradients, monitor, session
 from hgn.training.callbacks import LogLines
@@ -185,18 +187,23 @@ def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, capsys, 
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == updates
 
 
-def test_a_second_interrupt_does_not_wait(finished, monkeypatch):
-    """Two Ctrl-C within an update end the command immediately, by an interrupt as in every command."""
-    data, run = finished
+@pytest.mark.parametrize("later", [True, False])
+def test_a_second_interrupt(finished, monkeypatch, later):
+    """A second Ctrl-C within an update ends the command immediately, by an interrupt as in every command. If it is a
+    repetition of the first one, as launchers send it, the update is saved."""
+    (data, run), step = finished, TorchUpdates.step
 
     def signalled(updates, update):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
+        step(updates, update)
 
     monkeypatch.setattr(TorchUpdates, "step", signalled)
-    with pytest.raises(KeyboardInterrupt):
-        train.main(train_mapping(data, run, maximum_updates=14))
-    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 12
+    if later:
+        monkeypatch.setattr(signals, "ONE_REQUEST_S", -1.0)
+    with pytest.raises(KeyboardInterrupt) if later else nullcontext():
+        assert train.main(train_mapping(data, run, maximum_updates=14)) == 130
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == (12 if later else 13)
 
 
 @pytest.mark.parametrize("updates", [12, 5])
@@ -303,7 +310,7 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         monkeypatch.setenv("RANK", rank)
         stop = StopRequest()
         for number in order:
-            stop._on_signal(number, None)
+            stop._receive(number, None)
         told = "completed and saved; Ctrl-C (SIGINT) then ends the command at once\n"
         assert stop.exit_code == 138 and capfd.readouterr().err.count(told) == lines
 
