@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_481,
+    "hgn": 35_479,
     "datagen": 8_945,
     "tools": 6_296,
     "tests": 37_193,

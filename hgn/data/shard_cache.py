@@ -20,7 +20,7 @@ from pathlib import Path
 from hgn.data.verification import StorageError, note_verified, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system import patience
-from hgn.system.files import TEMPORARY_SUFFIX, sync_folder
+from hgn.system.files import TEMPORARY_SUFFIX, errors_name, sync_folder
 from hgn.system.locks import NO_LOCKS, lock_file, open_lock
 from hgn.system.patience import UnreachableError
 
@@ -194,12 +194,10 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
                 yield None
                 return
             try:
-                yield file
+                with errors_name(path):
+                    yield file
             except (ConfigError, OSError) as error:
-                full = isinstance(error, OSError) and error.errno in _FULL
-                if isinstance(error, OSError) and full:
-                    error.filename = error.filename or str(path)
-                if full or isinstance(error, ConfigError):
+                if isinstance(error, ConfigError) or error.errno in _FULL:
                     partial.unlink(missing_ok=True)
                 raise
             return
