@@ -72,7 +72,7 @@ class RankWatch(Callback):
         assert isinstance(pl_module, TrainingModule)
         self._own = self._folder / str(trainer.global_rank)
         self._write("0")
-        now = time.monotonic()
+        self._awake_s = now = time.monotonic()
         self._counts = {rank: ("", now) for rank in range(trainer.world_size) if rank != trainer.global_rank}
         self._woken, wake = os.pipe()
         os.set_blocking(wake, False)
@@ -144,6 +144,7 @@ class RankWatch(Callback):
     def _silent_ranks(self, count: str) -> list[int]:
         """Writes this rank's count, unless it has ended. Returns the ranks whose count did not change for SILENCE_S."""
         now = time.monotonic()
+        slept, self._awake_s = now - self._awake_s > SILENCE_S / 2, now  # a scheduler suspended the job
         try:
             with self._writing:
                 if not self._ended.is_set():
@@ -153,7 +154,9 @@ class RankWatch(Callback):
                     self._counts[rank] = text, now
                     if text == ENDED and before:  # without a count before, the file may be of an earlier run
                         self._over.append(rank)
-        except OSError:  # the folder is unreachable, so ranks may be alive
+        except OSError:  # the folder is unreachable
+            slept = True
+        if slept:  # the other ranks may be alive
             self._counts = {rank: (before, now) for rank, (before, _) in self._counts.items()}
         return [rank for rank, (_, changed) in self._counts.items() if now - changed > SILENCE_S]
 

@@ -154,3 +154,14 @@ def test_a_rank_that_waits_for_one_that_ended_ends(monkeypatch, ranks, tmp_path,
     for _ in range(4 * (not stuck)):
         ranks[0].beaten.acquire()
     assert ends.empty()
+
+
+def test_ranks_that_were_all_stopped_continue(monkeypatch, ranks):
+    """A scheduler may suspend a whole job for longer than a rank may be silent. A rank that stays stopped is named."""
+    clock = SimpleNamespace(monotonic=lambda: 0.0)
+    monkeypatch.setattr(watch, "time", clock)
+    monkeypatch.setattr(watch.threading, "Thread", lambda **_: SimpleNamespace(start=lambda: None))
+    ranks[0].start(None)
+    for fraction, silent in ((0, []), (5, []), (5.4, []), (5.8, []), (6.2, [1])):
+        clock.monotonic = lambda now=fraction * watch.SILENCE_S: now
+        assert ranks[0]._silent_ranks("1") == silent
