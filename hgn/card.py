@@ -111,12 +111,12 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
     }
     own = manifest.config.get("imported")
     scene = own or manifest.config["scene"]
+    materials = scene["materials"]
+    require(isinstance(materials, (list, tuple)), "config materials", "a list of names", materials)
     rows = {split: f"{number} episode{'s' * (number > 1)}" for split, number in episodes.items()}
     rows |= {
         "frames a second": f"{manifest.config['frame_rate_hz']:g}",
-        "materials": ", ".join(
-            dict.fromkeys([*scene["materials"], *({"elastic"} & {*(scene.get("own_physics") or ())})])
-        ),
+        "materials": ", ".join(dict.fromkeys([*materials, *({"elastic"} & {*(scene.get("own_physics") or ())})])),
         "gravity": "of each scene" if scene.get("kinds") else _vector(scene["gravity"]),
         "made by": f"an import of {own['format']} files" if own else "HGN's solver",
         **_reference_row(manifest.config.get("reference")),

@@ -175,5 +175,5 @@ def errors_in_config(folder: Path | str) -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise ConfigError(f"{folder} must have a config that this version can read, got {error!r}") from error

@@ -101,14 +101,26 @@ def test_cards_show_names_as_words(name):
     assert all(text.count(character) == usual.count(character) for character in "\n|`")
 
 
-@pytest.mark.parametrize("config", [{}, {"scene": 3}, {"imported": {}}, {"imported": 5, "frame_rate_hz": "x"}])
+KINDS = {"kinds": {"landslide": -1, "mixer": 1}, "materials": ["water"]}
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        *({}, {"scene": 3}, {"imported": {}}, {"imported": 5, "frame_rate_hz": "x"}),
+        {"scene": KINDS, "frame_rate_hz": 60.0},
+        {"imported": {"format": "plain", "materials": "water", "gravity": [0, 0, 0]}, "frame_rate_hz": 60.0},
+    ],
+)
 def test_configs_of_other_data_sets(tmp_path, config):
     """A manifest whose config is none of this version ends in one line: of a card, and of a training on it."""
     Manifest(identity_hash(config), config, {"train": 1}, 1).save(tmp_path, [shard(0)])
     sections = {name: {} for name in ("network", "training", "scene")}
     mapping = {"dataset": {"folder": str(tmp_path)}, "imported": True, **sections}
     for read in (lambda: card.main({"data": str(tmp_path)}), lambda: settings_of_imported(mapping)):
-        with pytest.raises(ConfigError, match=r"must have a config that this version can read|must be a data set of"):
+        with pytest.raises(
+            ConfigError, match=r"config that this version can read|must be a data set of|be a list of names"
+        ):
             read()
 
 
