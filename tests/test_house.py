@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_482,
     "datagen": 8_945,
     "tools": 6_296,
-    "tests": 37_216,
+    "tests": 37_231,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

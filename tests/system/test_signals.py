@@ -1,6 +1,5 @@
 """Signals at any line of the programs that write frames: these stay in a readable file."""
 
-import os
 import signal
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ from hgn.scene import rollout_file, simulated_frames
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.system import files, signals
 
-FRAMES, STRIDE = 4, int(os.environ.get("STRIDE", 23))
+FRAMES, STRIDE = 4, 23  # of the lines between two tested ones
 PLACES = {module.__file__ for module in (exchange, rollout_file, simulated_frames, files, signals)}
 
 
@@ -53,19 +52,22 @@ def frames_in(folder):
     return len([*folder.glob("*.ply")])
 
 
+def still():
+    """A rollout of which no frame was simulated."""
+    return Rollout(np.zeros((FRAMES, 5, 3), np.float32), np.zeros(5, np.uint8), (), (1.0, 1.0, 1.0), 60.0)
+
+
 @pytest.mark.parametrize("numbers", [[signal.SIGINT] * 2, [signal.SIGTERM, signal.SIGINT, signal.SIGTERM]])
 @pytest.mark.parametrize("name", ["a.vtkhdf", "a.ply", "a.usda"])
 def test_no_frame_is_lost(tmp_path, monkeypatch, capsys, name, numbers):
     """Signals at any line after the simulation: all frames are in a file, which a line names, and no other is left."""
     for line in range(1, 10_000, STRIDE):
         folder = tmp_path / str(line)
-        position_TN3 = np.zeros((FRAMES, 5, 3), np.float32)
-        rollout = Rollout(position_TN3, np.zeros(5, np.uint8), (), (1.0, 1.0, 1.0), 60.0)
         interruption = Interruption(line, numbers)
 
-        def main(_, folder=folder, rollout=rollout, interruption=interruption):
+        def main(_, folder=folder, interruption=interruption):
             try:
-                save_frames(folder / name, rollout, interruption.simulate)
+                save_frames(folder / name, still(), interruption.simulate)
             finally:
                 sys.settrace(None)
 
@@ -78,3 +80,14 @@ def test_no_frame_is_lost(tmp_path, monkeypatch, capsys, name, numbers):
         assert code - 128 in numbers and error.startswith(said), (line, error)
         assert Path(error.split("\n")[0].rpartition(" ")[2]).is_file()
         assert not [each for each in folder.iterdir() if each.name.startswith(".")]
+
+
+def test_an_error_of_a_writer(tmp_path, monkeypatch, capsys):
+    """It is raised, the frames are in a new VTKHDF file, and an older file stays."""
+    monkeypatch.setattr(exchange, "_write_ply", lambda *_: 1 / 0)
+    for file in ("a.ply.vtkhdf", "a.ply1.vtkhdf"):
+        with pytest.raises(ZeroDivisionError):
+            save_frames(tmp_path / "a.ply", still(), lambda take: [take(np.ones((5, 3))) for _ in range(FRAMES)])
+        assert capsys.readouterr().err == f"{FRAMES} of {FRAMES} frames are in {tmp_path / file}\n"
+        assert (read_rollout(tmp_path / file).position_TN3 == 1).all()
+    assert len([*tmp_path.iterdir()]) == 2

@@ -4,7 +4,7 @@ import math
 import os
 import signal
 import zipfile
-from contextlib import nullcontext
+from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
 
@@ -201,8 +201,10 @@ def test_a_second_interrupt(finished, monkeypatch, later):
     monkeypatch.setattr(TorchUpdates, "step", signalled)
     if later:
         monkeypatch.setattr(signals, "ONE_REQUEST_S", -1.0)
-    with pytest.raises(KeyboardInterrupt) if later else nullcontext():
-        assert train.main(train_mapping(data, run, maximum_updates=14)) == 130
+    code = None
+    with suppress(KeyboardInterrupt):
+        code = train.main(train_mapping(data, run, maximum_updates=14))
+    assert code == (None if later else 130)
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == (12 if later else 13)
 
 
