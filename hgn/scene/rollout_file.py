@@ -148,7 +148,7 @@ def write_frames(path: Path, rollout: Rollout, simulate: Simulation) -> None:
     """Writes the frames of `simulate` as they come, and puts them into `rollout.position_TN3`.
 
     Once a second the new frames are appended to a temporary file. The file is renamed to `path` at the end, also after
-    Ctrl-C, an OSError or a ConfigError. Other errors leave no file. The space for all frames is reserved first.
+    Ctrl-C or an error of the simulation. The space for all frames is reserved first.
     Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)

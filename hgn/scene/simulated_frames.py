@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hgn.schema import ConfigError
 from hgn.system.signals import interrupt, signals_delayed
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ class SimulatedFrames:
 
         try:
             simulate(take)
-        except (KeyboardInterrupt, OSError, ConfigError) as error:
+        except (KeyboardInterrupt, Exception) as error:
             self._delay()
             if self.count < 2:  # frame 0 is the initial state
                 raise
@@ -58,8 +57,8 @@ class SimulatedFrames:
 def simulated(position_TN3: np.ndarray) -> Iterator[SimulatedFrames]:
     """Yields the frames, not yet simulated, to a block that simulates and writes them.
 
-    Signals between the end of the simulation and the end of the block are delayed. After an interruption (a signal, an
-    error of the disk or a ConfigError) a line names the file with the frames, and the interruption is raised.
+    Signals between the end of the simulation and the end of the block are delayed. After an interruption (a signal or
+    an error) a line names the file with the frames, and the interruption is raised.
     """
     delayed = ExitStack()
     frames = SimulatedFrames(position_TN3, delayed)
