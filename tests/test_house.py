@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 35_481,
-    "datagen": 8_945,
+    "datagen": 8_956,
     "tools": 6_296,
-    "tests": 37_230,
+    "tests": 37_255,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

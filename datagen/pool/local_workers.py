@@ -1,12 +1,13 @@
 """Runs workers in processes of this machine.
 
-A worker ends with its parent, and ignores signals from the terminal. Its errors are sent to the parent.
+A worker ends with its parent, ignores Ctrl-C, and ends in order after SIGTERM. Its errors are sent to the parent.
 """
 
 import contextlib
 import os
 import pkgutil
 import signal
+import sys
 import threading
 import time
 from collections import defaultdict
@@ -40,11 +41,11 @@ from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.system.processes import cause_of_exit, start_child
+from hgn.system.signals import Signals
 
 _FRAME_REPORT_SECONDS = 1.0  # interval between a worker's reports; each is a line with progress=json
 _STAGING_THREADS = 8
 _STAGING_FRAME = 8  # frame of a launch at which the results of the launch before are staged
-_END_SECONDS = 10.0  # time in which a dismissed worker must end
 
 
 class LocalWorker(Worker):
@@ -56,7 +57,7 @@ class LocalWorker(Worker):
         super().__init__()
         with _terminal_signals_blocked():
             self.process, self.connection = start_child(_run, target, *arguments)
-        self.idle, self._patience_s = True, 0.0
+        self.idle = True
 
     def give(self, message: object) -> None:
         self.idle, self.heard_at = False, time.monotonic()
@@ -70,14 +71,13 @@ class LocalWorker(Worker):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 
-    def dismiss(self) -> None:
-        # at its end the process writes compiled kernels to Taichi's cache
-        self.connection.close()
-        self._patience_s = _END_SECONDS
+    def dismiss(self, deadline_s: float) -> None:
+        # at its end the process stages the scenes that it has simulated, and writes kernels to Taichi's cache
+        self.process.terminate()
+        self.process.join(max(0.0, deadline_s - time.monotonic()))
 
     def kill(self) -> None:
         # staged files are written atomically, so no partial file remains
-        self.process.join(self._patience_s)
         self.process.kill()
         self.process.join()
         self.connection.close()
@@ -120,7 +120,7 @@ class LocalWorkerFactory:
 def _run(connection: Connection, target: Callable[..., None], *arguments: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     send = _Sender(connection)
-    with _errors_sent(send):
+    with Signals(lambda number: sys.exit(128 + number), numbers=(signal.SIGTERM,)), _errors_sent(send):
         target(connection, send, *arguments)
 
 
@@ -252,7 +252,7 @@ def _solve(
                 send("frame", 0, 0)
                 if not on_gpu:
                     send("idle")
-        finally:  # also after an error in the next batch
+        finally:  # also after SIGTERM, or an error in the next batch
             stage_finished()
 
 

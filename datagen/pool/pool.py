@@ -22,6 +22,7 @@ MAXIMUM_ATTEMPTS = 3  # deaths of workers that had only one scene, after which t
 _WAIT_SECONDS = 0.2  # longest time until a stop request is noticed
 _PACKING_SECONDS = 0.02  # maximum delay between packing and publishing a shard
 _LOOK_SECONDS = 1.0  # interval of checks for shards of other generators
+_END_SECONDS = 10.0  # time in which dismissed solvers must end
 _LAUNCH_GROWTH = 32  # factor by which launches grow from the first one to the full size
 
 
@@ -71,14 +72,24 @@ class Pool:
                 self._hand_out()
                 published = self._publish()
                 if not published and self._writer.complete:
-                    for solver in self._solvers:
-                        solver.dismiss()
                     return
                 self._receive(0.0 if published else _PACKING_SECONDS if self._writer.packing else _WAIT_SECONDS)
         finally:
+            self._end_workers()
+            self._progress.close()
+
+    def _end_workers(self) -> None:
+        """Waits a short time for solvers to stage what they have simulated. A second Ctrl-C ends the wait."""
+        try:
+            for deadline_s in (0.0, time.monotonic() + _END_SECONDS):  # all end at the same time
+                for solver in self._solvers:
+                    solver.dismiss(deadline_s)
+        finally:
             for worker in (*self._makers, *self._solvers):
                 worker.kill()
-            self._progress.close()
+        for task in [_task(item) for solver in self._solvers for item in solver.tasks.values()]:
+            if self._writer.is_staged(task.split, task.index):
+                self._accept(task)
 
     def _start_workers(self) -> None:
         missing = self._writer.total - self._writer.done

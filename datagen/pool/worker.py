@@ -108,8 +108,8 @@ class Worker(ABC):
         """Sends a worker one part of its task, for example the obstacle grid of a scene that it simulates."""
         raise NotImplementedError
 
-    def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
-        """Asks an idle worker to end. `kill` then waits for a short time."""
+    def dismiss(self, deadline_s: float) -> None:  # noqa: B027 - Ray ends its actors itself
+        """Asks the worker to keep what it has simulated, and to end. Waits until then, or time.monotonic()."""
 
     @abstractmethod
     def kill(self) -> None:

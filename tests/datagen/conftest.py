@@ -47,9 +47,6 @@ class ThreadProcess:
     def join(self, timeout=None):
         self._thread.join(timeout)
 
-    def kill(self):
-        pass
-
 
 def start_thread(run, target, *arguments):
     here, there = multiprocessing.Pipe()
@@ -57,6 +54,9 @@ def start_thread(run, target, *arguments):
 
 
 class ThreadWorker(local_workers.LocalWorker):
+    def dismiss(self, deadline_s):
+        pass
+
     def kill(self):
         self.connection.close()  # the thread ends at its next word
         self.process.join()

@@ -253,6 +253,28 @@ def test_workers_that_die_while_stopping(make_config, backend, control, threads)
     assert recorder.messages == [] and len(simulated(control)) == 1
 
 
+def test_simulated_scenes_are_kept_after_a_stop(make_config, backend, control):
+    """A stop while the second launch runs keeps the first one, whose staging waits for the second to be under way."""
+    count = local_workers._STAGING_THREADS + 1
+    config = make_config(training_scenes=2 * count, validation_scenes=0, test_scenes=0)
+    first, second = (control / f"hold-{scene_seed(0, 'train', index, 0)}" for index in (0, count))
+    for path in (first, second, control / "simulated.log"):
+        path.touch()
+    with DatasetWriter(config) as writer:
+        factory = LocalWorkerFactory(config, backend, WorkerPlan(1, None, 1, count, count))
+
+        def ready():
+            made = [made for solver in stopped._solvers for made in solver.tasks.values()]
+            if len(made) == 2 * count and all(one.obstacle_grid for one in made):
+                first.unlink(missing_ok=True)
+            return len(simulated(control)) > count
+
+        stopped = Pool(writer, Recorder(), factory, ready)
+        with pytest.raises(Stopped):
+            stopped.run()
+        assert writer.done == count
+
+
 def test_two_generators_at_once(make_config, small_dataset, backend, control, threads):
     """Two that share a folder at once: each scene is simulated and each shard published once, both end with the whole
     data set, and it is bitwise the one that a single generator makes."""
@@ -345,6 +367,9 @@ class StoppedWorker(LocalWorker):
         self.killed, self.idle = False, True
 
     def tell(self, message):
+        pass
+
+    def dismiss(self, deadline_s):
         pass
 
     def kill(self):
