@@ -24,7 +24,7 @@ from hgn.config import config_directory
 from hgn.schema import PATH_RULE, ConfigError, is_path, printable, require
 from hgn.system.extras import missing_extra
 from hgn.system.machine import memory_is_full
-from hgn.system.signals import Signals, interrupt
+from hgn.system.signals import Signals, interrupt, signals_delayed
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 
@@ -193,6 +193,7 @@ def _unread() -> bool:
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
+@signals_delayed()  # Hydra and OmegaConf report interruptions as errors of settings
 def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:
     """Returns the configurations of the command line. With `complete=False` required keys may be missing."""
     from hgn.hydra_compat import compose

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from hgn import hydra_compat
 from hgn.command import EXIT_UNREAD, _compose, run_command
 from hgn.schema import ConfigError
 from hgn.system.files import make_folder, temporary_file, write_json
@@ -161,6 +162,21 @@ def test_signals(tmp_path, command, number, passed_on):
     assert (code, error) == (128 + number, "error: interrupted\n") and [*tmp_path.iterdir()] == [tmp_path / "kept"]
     assert signal.getsignal(number) is before
     signal.signal(signal.SIGINT, outer)
+
+
+def test_signals_while_settings_are_read(command, monkeypatch):
+    """They end the command as later ones do. Hydra and OmegaConf report an interruption as an error of a setting."""
+    compose = hydra_compat.compose
+
+    def interrupted(*arguments):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt as interruption:
+            raise ConfigError("settings must follow Hydra's syntax") from interruption
+        return compose(*arguments)
+
+    monkeypatch.setattr(hydra_compat, "compose", interrupted)
+    assert command("bench") == (143, [], "error: interrupted\n")
 
 
 @pytest.mark.parametrize("place", ["pipe", "pipe/a/b", "/dev/null", "/dev/null/a", "link"])
