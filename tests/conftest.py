@@ -36,6 +36,8 @@ import warm_server
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels run in Triton's interpreter; said before any of them is defined
+    for name in [each for each in sys.modules if each.startswith("triton") and not each.startswith("triton._C")]:
+        del sys.modules[name]  # warm_server.py has loaded it, whose own functions would be compiled
     if importlib.util.find_spec("triton"):
         interpreter.spare_repeated_work()
 
@@ -52,9 +54,13 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """All processes of these tests share a warm interpreter; the first that asks for it has it started."""
+    """All processes of these tests share a warm interpreter; the first that asks for it has it started. Those of
+    pytest-xdist are forks of it."""
     if not hasattr(config, "workerinput"):
-        config.add_cleanup(warm_server.WarmServer().stop)
+        processes = getattr(config.option, "tx", None) or []
+        config.add_cleanup(warm_server.WarmServer(warm_server.FOR_TESTS if processes else ()).stop)
+        if set(processes) == {"popen"}:
+            config.option.tx = [f"popen//python={os.environ[warm_server.VARIABLE]}/python"] * len(processes)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,7 +1,7 @@
 """Replaces the interpreter: sends its arguments to warm_server.py and ends like the program there.
 
-`python -SEs warm_client.py SOCKET [-u] (-m MODULE | FILE) ARGUMENTS`; WARM_PARENT in the program's environment is the
-process that started this one.
+`python -SEs warm_client.py SOCKET [-u] (-m MODULE | -c TEXT | FILE) ARGUMENTS`; WARM_PARENT in the environment of the
+program is the process that started this one.
 """
 
 import json

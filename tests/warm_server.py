@@ -1,7 +1,8 @@
 """Runs programs as forks of a Python process with the training stack loaded, because loading PyTorch and Lightning
-takes seconds and the tests start dozens of trainings. `python warm_server.py LISTENER` loads them once and, before any
-thread or device exists, forks for each request of warm_client.py, which replaces the interpreter: arguments, folder,
-environment, network, standard streams, signals and exit status are the same.
+takes seconds and the tests start dozens of trainings. `python warm_server.py LISTENER MODULES` loads them once and,
+before any thread or device exists, forks for each request of warm_client.py, which replaces the interpreter: arguments,
+folder, environment, network, standard streams, signals and exit status are the same. The processes of pytest-xdist are
+such programs too.
 """
 
 import atexit
@@ -21,6 +22,7 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
+from types import ModuleType
 
 PRELOADED = (
     *("lightning.pytorch", "lightning.pytorch.loggers", "tensorboard.compat.proto.summary_pb2", "hydra", "h5py"),
@@ -28,6 +30,7 @@ PRELOADED = (
     *("torch.distributed.algorithms.ddp_comm_hooks.debugging_hooks", "hgn.hydra_compat", "hgn.training.monitor"),
     *("hgn.rollout", "hgn.evaluate", "hgn.export", "hgn.train", "hgn.training.session", "hgn.training.tensorboard"),
 )
+FOR_TESTS = ("datagen.mpm.device", "matplotlib.pyplot", "mpl_toolkits.mplot3d", "pxr.Usd", "scipy.stats", "trimesh")
 REQUEST_BYTES = 1 << 20
 VARIABLE = "HGN_TESTS_WARM"  # the folder with the interpreter, `python`, in the environment of a run's processes
 
@@ -35,7 +38,8 @@ VARIABLE = "HGN_TESTS_WARM"  # the folder with the interpreter, `python`, in the
 class WarmServer:
     """Makes the interpreter, whose first caller has the server started."""
 
-    def __init__(self):
+    def __init__(self, modules=()):
+        self._modules = modules
         self._folder = tempfile.TemporaryDirectory(prefix="hgn-tests-")
         folder, here = Path(self._folder.name), Path(__file__).parent
         os.environ[VARIABLE] = str(folder)
@@ -55,7 +59,7 @@ class WarmServer:
         environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
         if self._listener in select.select([self._listener, self._wake], [], [])[0]:
             number = self._listener.fileno()
-            command = [sys.executable, __file__, str(number)]
+            command = [sys.executable, __file__, str(number), *self._modules]
             self._server = subprocess.Popen(command, env=environment, pass_fds=[number])
         self._listener.close()  # where the server has ended, its clients are refused
 
@@ -146,6 +150,11 @@ def run(request):
         sys.argv = arguments[1:]
         sys.modules.pop(arguments[1], None)  # runpy warns of a program that is loaded already
         runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+    elif arguments[0] == "-c":
+        sys.path[:0] = ["", *paths]
+        sys.argv = ["-c", *arguments[2:]]
+        main = sys.modules["__main__"] = ModuleType("__main__")  # spawned processes run nothing of this file
+        exec(arguments[1], main.__dict__)
     else:
         sys.path[:0] = [str(Path(arguments[0]).parent), *paths]
         sys.argv = arguments
@@ -174,7 +183,7 @@ if __name__ == "__main__":
 
     from hydra.core.plugins import Plugins
 
-    for name in PRELOADED:
+    for name in (*PRELOADED, *sys.argv[2:]):
         importlib.import_module(name)
     from torch.distributed.elastic.rendezvous import dynamic_rendezvous
 
