@@ -337,8 +337,8 @@ def require_replaceable(field: str, *files: Path) -> None:
 def require_bounds(owner: object) -> None:
     """Checks the fields of a dataclass, and the items of its tuples, against the `Bound`s of their annotations."""
     cls: Any = type(owner)
-    for name, hint in _bounded_hints(cls).items():
-        _require_bound(hint, getattr(owner, name), name)
+    for name, bounds in _bounds_of_fields(cls).items():
+        _require_bound(bounds, getattr(owner, name), name)
 
 
 class Bounded:
@@ -349,27 +349,26 @@ class Bounded:
 
 
 @functools.cache
-def _bounded_hints(cls: type) -> dict[str, Any]:
+def _bounds_of_fields(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls, include_extras=True)
-    return {name: hint for name, hint in hints.items() if _is_bounded(hint)}
+    return {name: bounds for name, hint in hints.items() if (bounds := _bounds_of(hint))}
 
 
-def _is_bounded(hint: Any) -> bool:
-    return hasattr(hint, "__metadata__") or any(map(_is_bounded, typing.get_args(hint)))
+def _bounds_of(hint: Any) -> tuple[tuple[Bound, ...], Any, Any] | None:
+    """Returns the bounds of a type, its origin, and the same of its items or its option; None without bounds."""
+    own, item = getattr(hint, "__metadata__", ()), next(filter(None, map(_bounds_of, typing.get_args(hint))), None)
+    return (own, typing.get_origin(hint), item) if own or item else None
 
 
-def _require_bound(hint: Any, value: Any, name: str) -> None:
-    for bound in getattr(hint, "__metadata__", ()):
+def _require_bound(bounds: Any, value: Any, name: str) -> None:
+    own, origin, item = bounds
+    for bound in own:
         require(bound.holds(value), name, bound.rule, value)
-    options = [option for option in typing.get_args(hint) if _is_bounded(option)]
-    if typing.get_origin(hint) is tuple:
-        for i, item in enumerate(value):
-            _require_bound(options[0], item, f"{name}[{i}]")
-    elif typing.get_origin(hint) is dict:
-        for key, item in value.items():
-            _require_bound(options[0], item, f"{name}.{key}")
-    elif options and value is not None:  # an optional type
-        _require_bound(options[0], value, name)
+    if item and origin in (tuple, dict):
+        for key, each in value.items() if origin is dict else enumerate(value):
+            _require_bound(item, each, f"{name}.{key}" if origin is dict else f"{name}[{key}]")
+    elif item and value is not None:  # an optional type
+        _require_bound(item, value, name)
 
 
 def _text(path: _Path) -> str:

@@ -28,7 +28,7 @@ from hgn.scene.polygons import (
 )
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
-from hgn.scene.surface import area_vectors, point_tree
+from hgn.scene.surface import area_vectors, distinct_rows, point_tree
 from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, near_file, no_file, require, require_vector
 from hgn.system.claims import Claims
@@ -199,39 +199,39 @@ def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray,
     Vertices at equal positions count as one. Triangles with fewer than three distinct vertices do not count, and equal
     triangles count once.
     """
-    _, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
-    triangle = index.reshape(-1)[triangle_F3]
+    _, _, index_V = distinct_rows(vertex_V3)
+    triangle = index_V[triangle_F3]
     different_F = (triangle != np.roll(triangle, 1, axis=1)).all(axis=1)
-    _, first, alike_F = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True, return_inverse=True)
+    _, first, alike_F = distinct_rows(np.sort(triangle, axis=1))
     counted = np.sort(first[different_F[first]])
     closed_F, flip_F = np.zeros((2, len(triangle)), bool)
     if len(counted):
         closed_F[counted], flip_F[counted] = _orientation(triangle[counted])
-    return closed_F[first][alike_F.reshape(-1)], flip_F  # repeated triangles belong to the body of the first one
+    return closed_F[first][alike_F], flip_F  # repeated triangles belong to the body of the first one
 
 
 def _joined(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> np.ndarray:
     """Returns the vertices, float64 [V, 3]. Vertices at open edges within SEAM of each other get the same position."""
-    unique_U3, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
-    triangle = index.reshape(-1)[triangle_F3]
+    unique_U3, _, index_V = distinct_rows(vertex_V3)
+    triangle = index_V[triangle_F3]
     edge_E2 = np.sort(np.stack([triangle, np.roll(triangle, -1, axis=1)], -1).reshape(-1, 2), axis=1)
-    edge_E2, uses_E = np.unique(edge_E2, axis=0, return_counts=True)
-    border = np.unique(edge_E2[uses_E != 2])
+    edge_E2, _, own_E = distinct_rows(edge_E2)
+    border = np.unique(edge_E2[np.bincount(own_E) != 2])
     reach = SEAM * (np.ptp(unique_U3[triangle].reshape(-1, 3), axis=0).max() or 1.0)  # 0 if all corners are one
-    _, inside = np.unique(np.floor(unique_U3[border] / reach), axis=0, return_counts=True)
-    if (inside**2).sum() < MOST_NEAR * len(border):
+    _, _, cell = distinct_rows(np.floor(unique_U3[border] / reach))
+    if (np.bincount(cell) ** 2).sum() < MOST_NEAR * len(border):
         row, column = point_tree(unique_U3[border]).query_pairs(reach, output_type="ndarray").T
         _, label = _components(row, column, len(border))
         unique_U3[border] = unique_U3[border[np.unique(label, return_index=True)[1][label]]]
-    return np.asarray(unique_U3[index.reshape(-1)])
+    return np.asarray(unique_U3[index_V])
 
 
 def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merges equal vertices. Removes zero-area and repeated triangles, and unused vertices."""
-    unique, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)  # + 0.0 turns -0 into 0
-    triangle = index.reshape(-1)[triangle_F3]
+    unique, _, index_V = distinct_rows(vertex_V3 + 0.0)  # turns -0 into 0
+    triangle = index_V[triangle_F3]
     triangle = triangle[(area_vectors(unique[triangle]) != 0).any(axis=1)]
-    _, first = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True)
+    _, first, _ = distinct_rows(np.sort(triangle, axis=1))
     triangle = triangle[np.sort(first)]
     used, compact = np.unique(triangle, return_inverse=True)
     return unique[used], compact.reshape(-1, 3).astype(np.int32)

@@ -98,6 +98,20 @@ def area_vectors(corner_F33: np.ndarray) -> np.ndarray:
     return 0.5 * np.cross(corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0])
 
 
+def distinct_rows(row_NK: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the distinct rows in order, the first place of each, and the number of each given row, as np.unique does.
+
+    np.unique with an axis takes several times as long.
+    """
+    order = np.lexsort(row_NK.T[::-1])
+    sorted_NK = row_NK[order]
+    new = np.ones(len(order), bool)
+    new[1:] = (sorted_NK[1:] != sorted_NK[:-1]).any(axis=1)
+    number_N = np.empty(len(order), np.int64)
+    number_N[order] = np.cumsum(new) - 1
+    return sorted_NK[new], order[new], number_N
+
+
 def _weights(corner: np.ndarray, spacing: float) -> np.ndarray:
     area = np.sqrt((area_vectors(corner) ** 2).sum(axis=1))
     edge = np.roll(corner, -1, axis=1) - corner

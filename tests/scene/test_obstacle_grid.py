@@ -10,7 +10,7 @@ from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.shapes import shape_obstacle
-from hgn.scene.surface import sample_surface, split_long_edges
+from hgn.scene.surface import distinct_rows, sample_surface, split_long_edges
 from hgn.schema import ConfigError
 
 CELL = 1 / 64
@@ -32,6 +32,14 @@ def sheet(*heights, flipped=False):
 
 def quarter(obstacle):
     return Obstacle(obstacle.name, 0.25 * obstacle.vertex_V3 + 0.25, obstacle.triangle_F3, obstacle.closed)
+
+
+def test_distinct_rows_are_those_of_numpy():
+    """For rows with and without repetitions, for one row, and with -0."""
+    for row_NK in (rng().integers(-2, 2, (300, 3)), rng().random((50, 3)).round(1), np.ones((1, 2)), -np.eye(3)):
+        expected = np.unique(row_NK, axis=0, return_index=True, return_inverse=True)
+        for found, value in zip(distinct_rows(row_NK), expected, strict=True):
+            np.testing.assert_array_equal(found, value.reshape(found.shape))
 
 
 @pytest.mark.parametrize("shape", OBSTACLE_SHAPES)
