@@ -40,7 +40,7 @@ from datagen.pool.worker_plan import WorkerPlan
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.system.processes import cause_of_exit, start_child
+from hgn.system.processes import ENDED, cause_of_exit, start_child
 from hgn.system.signals import Signals
 
 _FRAME_REPORT_SECONDS = 1.0  # interval between a worker's reports; each is a line with progress=json
@@ -112,7 +112,7 @@ class LocalWorkerFactory:
             worker = by_connection[connection]  # type: ignore[index]
             try:
                 message = worker.connection.recv()
-            except (EOFError, ConnectionResetError):
+            except ENDED:
                 message = None
             yield worker, message
 
@@ -286,7 +286,7 @@ def _received(connection: Connection) -> Iterator[Any]:
     while True:
         try:
             yield connection.recv()
-        except (EOFError, ConnectionResetError):
+        except ENDED:
             return
 
 

@@ -18,7 +18,7 @@ from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, error_message
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
-from hgn.system.processes import cause_of_exit, start_child
+from hgn.system.processes import ENDED, cause_of_exit, start_child
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STOP_PATIENCE_S = 60.0
@@ -119,7 +119,7 @@ class Supervisor:
                     self._note(kind, *values)
                 elif kind != "alive":
                     outcome, text = kind, " ".join(str(value) for value in values if value is not None)
-        except (EOFError, ConnectionResetError):
+        except ENDED:
             process.join()
         finally:
             connection.close()

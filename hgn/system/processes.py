@@ -13,6 +13,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, BinaryIO
 
 PR_SET_PDEATHSIG = 1  # from linux/prctl.h
+ENDED = (EOFError, OSError)  # errors of `recv` if the other process has ended; OSError: in the middle of a message
 
 
 def die_with_parent(number: int) -> None:

@@ -4,12 +4,15 @@ import contextlib
 import dataclasses
 import errno
 import multiprocessing
+import os
 import pickle
 import shutil
+import signal
 import tarfile
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import ballistic_solver
 import numpy as np
@@ -23,6 +26,7 @@ from datagen.pool.pool import Pool, Stopped
 from datagen.pool.worker import Backend, MadeScene, Parcel, Worker, make_scene
 from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
+from datagen.service import supervisor
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -251,6 +255,22 @@ def test_workers_that_die_while_stopping(make_config, backend, control, threads)
         factory = LocalWorkerFactory(config, backend, ONE)
         Pool(writer, recorder, factory, lambda: (control / "simulated.log").exists()).run()
     assert recorder.messages == [] and len(simulated(control)) == 1
+
+
+@pytest.mark.parametrize("sent", [b"", b"\0", b"\0\0\1\0" + bytes(9)])
+def test_a_process_that_is_killed_in_a_message(make_config, monkeypatch, sent):
+    """It is a dead one to the pool, its workers and the service. Full memory may end a maker that sends a scene."""
+    ends = [multiprocessing.Pipe() for _ in range(3)]
+    for _, end in ends:
+        os.write(end.fileno(), sent)
+        end.close()
+    worker = StoppedWorker()
+    worker.connection = ends[0][0]
+    assert list(LocalWorkerFactory.receive(None, [worker], 1.0)) == [(worker, None)]
+    assert list(local_workers._received(ends[1][0])) == []
+    dead = SimpleNamespace(join=lambda: None, exitcode=-signal.SIGKILL)
+    monkeypatch.setattr(supervisor, "start_child", lambda *_, **__: (dead, ends[2][0]))
+    assert supervisor.Supervisor(make_config(), Recorder())._run_once() == ("died", "ended by SIGKILL")
 
 
 def test_simulated_scenes_are_kept_after_a_stop(make_config, backend, control):
