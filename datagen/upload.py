@@ -65,7 +65,9 @@ def upload(folder: Path, url: str, stop: Signals) -> Manifest:
         for shard in manifest.shards.since(len(there.shards)):
             if stop.requested:
                 return there
-            remote.write(shard.name, open_storage(folder).shard(shard.name, shard.sha256, shard.bytes))
+            path = open_storage(folder).shard(shard.name, shard.sha256, shard.bytes)
+            if not remote.has(shard.name, path):  # an earlier copy, without its manifest, was interrupted
+                remote.write(shard.name, path)
             progress.update(shard.bytes)
     if (there.revision, there.requested) == (manifest.revision, manifest.requested):
         return there

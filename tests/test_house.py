@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_496,
-    "datagen": 8_956,
+    "hgn": 35_513,
+    "datagen": 8_958,
     "tools": 6_296,
-    "tests": 37_314,
+    "tests": 37_323,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -33,6 +33,7 @@ from hgn.system.patience import UnreachableError, inside, patiently, standard_pa
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
+_COMPARED_BYTES = 1 << 16  # at the beginning and at the end of a file that may have been copied
 _CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole answer
 _AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
 _PROXY = re.compile(r"http://([^\s/?#]+@)?([\w.-]+|\[[\w.:]+\])(?::(\d{1,5}))?/?")
@@ -329,6 +330,22 @@ class RemoteStorage(Storage):
             ) from None
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
+
+    def has(self, name: str, source: Path) -> bool:
+        """Returns whether an earlier `write` was completed: size, beginning and end are those of the source."""
+        size = source.stat().st_size
+        try:
+            if self._patiently(name, None, lambda path: self._files.info(path)["size"]) != size:
+                return False
+            with source.open("rb") as file:
+                for start in (0, max(0, size - _COMPARED_BYTES)):
+                    file.seek(start)
+                    part = file.read(_COMPARED_BYTES)
+                    if self.read(name, start, start + len(part)) != part:
+                        return False
+        except FileNotFoundError:
+            return False
+        return True
 
     def _fill(self, file: BufferedRandom, append: Append, name: str, size: int, patience_s: float | None) -> str:
         """Appends the missing bytes. Returns the sha256 of the whole file."""

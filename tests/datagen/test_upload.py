@@ -44,13 +44,13 @@ def test_copy_is_the_data_set(make_config, make_dataset, capsys):
 
 @pytest.mark.parametrize("signalled", [False, True])
 def test_copying_that_is_cut_off(folder, monkeypatch, store, signalled):
-    """Wherever copying ends, the index lists no missing file, and the same command completes the copy. After a signal
-    no further shard is copied."""
+    """Wherever copying ends, the index lists no missing file, and the same command copies the missing shards, those
+    that were cut off, and others of the same name and size. After a signal no further shard is copied."""
     real, sent = type(store).put_file, []
 
     def cut(self, path, target, **options):
         sent.append(target)
-        if signalled:
+        if signalled and len(sent) == 2:
             real(self, path, target, **options)
             os.kill(os.getpid(), signal.SIGTERM)
         elif len(sent) == 4:
@@ -63,13 +63,22 @@ def test_copying_that_is_cut_off(folder, monkeypatch, store, signalled):
     with monkeypatch.context() as patch:
         patch.setattr(type(store), "put_file", cut)
         if signalled:
-            assert main(mapping) == 143 and len(store.store) == 1
+            assert main(mapping) == 143 and len(store.store) == 2
         else:
             with pytest.raises(KeyboardInterrupt):
                 main(mapping)
-    assert not EpisodeStore.available("memory://cut")
-    assert main(mapping) == 0
+        assert not EpisodeStore.available("memory://cut")
+        complete = sent[1 : 2 if signalled else 3]
+        store.pipe_file(sent[0], store.cat_file(sent[0])[:-1] + b"?")
+        sent.clear()
+        patch.setattr(
+            type(store), "put_file", lambda self, path, *rest, **_: (sent.append(*rest), real(self, path, *rest))
+        )
+        assert main(mapping) == 0
     assert keys("memory://cut") == keys(folder)
+    assert {Path(name).name for name in sent} == {shard.name for shard in Manifest.load(folder).shards} - {
+        Path(name).name for name in complete
+    }
 
 
 def test_what_is_refused(folder, make_config, make_dataset, tmp_path):
