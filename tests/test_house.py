@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 35_513,
-    "datagen": 8_958,
+    "datagen": 8_960,
     "tools": 6_296,
-    "tests": 37_323,
+    "tests": 37_326,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

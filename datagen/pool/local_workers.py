@@ -1,6 +1,7 @@
 """Runs workers in processes of this machine.
 
-A worker ends with its parent, ignores Ctrl-C, and ends in order after SIGTERM. Its errors are sent to the parent.
+A worker ends with its parent, ignores signals of the terminal, and ends in order after SIGTERM. Its errors are sent to
+the parent.
 """
 
 import contextlib
@@ -118,7 +119,8 @@ class LocalWorkerFactory:
 
 
 def _run(connection: Connection, target: Callable[..., None], *arguments: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     send = _Sender(connection)
     with Signals(lambda number: sys.exit(128 + number), numbers=(signal.SIGTERM,)), _errors_sent(send):
         target(connection, send, *arguments)

@@ -274,7 +274,8 @@ def test_a_process_that_is_killed_in_a_message(make_config, monkeypatch, sent):
 
 
 def test_simulated_scenes_are_kept_after_a_stop(make_config, backend, control):
-    """A stop while the second launch runs keeps the first one, whose staging waits for the second to be under way."""
+    """A stop while the second launch runs keeps the first one, whose staging waits for the second to be under way. A
+    closed terminal signals workers too."""
     count = local_workers._STAGING_THREADS + 1
     config = make_config(training_scenes=2 * count, validation_scenes=0, test_scenes=0)
     first, second = (control / f"hold-{scene_seed(0, 'train', index, 0)}" for index in (0, count))
@@ -287,7 +288,9 @@ def test_simulated_scenes_are_kept_after_a_stop(make_config, backend, control):
             made = [made for solver in stopped._solvers for made in solver.tasks.values()]
             if len(made) == 2 * count and all(one.obstacle_grid for one in made):
                 first.unlink(missing_ok=True)
-            return len(simulated(control)) > count
+            if late := len(simulated(control)) > count:
+                os.kill(stopped._solvers[0].process.pid, signal.SIGHUP)
+            return late
 
         stopped = Pool(writer, Recorder(), factory, ready)
         with pytest.raises(Stopped):
