@@ -6,6 +6,8 @@ from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 
 def spare_repeated_work():
     """For the rest of this process (Triton 3.6 to 3.9). More than half of the kernels' time goes there without it."""
@@ -62,7 +64,7 @@ def _remember_constants(core, semantic):
     conversion, nor have a pointer and a whole number; all other operands go the language's own way."""
     check, integers = semantic.binary_op_type_checking_impl, (core.int32, core.int64)
     constants: dict[tuple[Any, ...], Any] = {}
-    covered: dict[tuple[int, int], bool] = {}
+    results: dict[tuple[str, str], Any] = {}
 
     def constant(self, value, beside):
         key = value, type(value), beside.type.name
@@ -71,13 +73,19 @@ def _remember_constants(core, semantic):
             constants[key] = self.broadcast_impl_value(beside, scalar)[1]
         return constants[key]
 
-    def covers(left, right):
-        """Whether a shape is that of a result of both. Shapes live on in `_remember_shapes`."""
-        key = id(left), id(right)
-        if key not in covered:
-            sides = zip(reversed(tuple(left)), reversed(tuple(right)), strict=False)
-            covered[key] = len(right) <= len(left) and all(one in (1, other) for other, one in sides)
-        return covered[key]
+    def offset(self, value):
+        if value not in constants:
+            constants[value] = self.scalar_constant(value, core.int32)
+        return constants[value]
+
+    def wider(left, right):
+        """The type of a result that has both shapes and the first one's numbers; None: the first one."""
+        key = left.name, right.name
+        if key not in results:
+            shapes = [tuple(each.shape) if each.is_block() else () for each in (left, right)]
+            shape = np.broadcast_shapes(*shapes)
+            results[key] = None if shape == shapes[0] else core.block_type(left.scalar, list(shape))
+        return results[key]
 
     def operands(self, lhs, rhs, allow_lhs_ptr=False, allow_rhs_ptr=False, arithmetic_check=True, div_or_mod=False):
         if type(lhs) is core.tensor and arithmetic_check and not div_or_mod:
@@ -86,14 +94,17 @@ def _remember_constants(core, semantic):
                 right = rhs.type.scalar
                 pointer = left.is_ptr()
                 if (left is right and not pointer) or (pointer and allow_lhs_ptr and right.is_int()):
-                    # NumPy broadcasts the second operand, and the result has the first one's type
-                    wide = lhs.type.is_block() and (not rhs.type.is_block() or covers(lhs.type.shape, rhs.type.shape))
-                    return (lhs, rhs) if wide else self.broadcast_impl_value(lhs, rhs)
+                    # NumPy broadcasts the operands, and the result has the first one's type
+                    wide = wider(lhs.type, rhs.type)
+                    return (lhs if wide is None else core.tensor(lhs.handle, wide)), rhs
             elif type(rhs) is float:
                 if left.is_floating():
                     return lhs, constant(self, rhs, lhs)
-            elif type(rhs) is int and -(2**31) <= rhs < 2**31 and (left.is_floating() or left in integers):
-                return lhs, constant(self, rhs, lhs)
+            elif type(rhs) is int and -(2**31) <= rhs < 2**31:
+                if left.is_ptr() and allow_lhs_ptr:
+                    return lhs, offset(self, rhs)
+                if left.is_floating() or left in integers:
+                    return lhs, constant(self, rhs, lhs)
         return check(self, lhs, rhs, allow_lhs_ptr, allow_rhs_ptr, arithmetic_check, div_or_mod)
 
     semantic.binary_op_type_checking_impl = operands
@@ -102,6 +113,8 @@ def _remember_constants(core, semantic):
 def _remember_shapes(core, semantic):
     """Of tensors and their types, which the language wraps number by number for each result; of two tensors of one
     shape none is broadcast."""
+    from triton.runtime.interpreter import TensorHandle
+
     block_init, tensor_init, broadcast = core.block_type.__init__, core.tensor.__init__, semantic.broadcast_impl_value
     with_element_ty, block_types = core.block_type.with_element_ty, {}
     blocks: dict[tuple[int, ...], tuple[Any, int, str]] = {}
@@ -132,10 +145,16 @@ def _remember_shapes(core, semantic):
             block_types[key] = with_element_ty(self, scalar_ty)
         return block_types[key]
 
+    def splat(scalar, block):
+        data = np.full(tuple(block.shape), scalar.handle.data[0])
+        return core.tensor(TensorHandle(data, scalar.type), block.with_element_ty(scalar.type))
+
     def broadcast_unlike(self, lhs, rhs):
-        if lhs.type.is_block() and rhs.type.is_block() and lhs.type.shape is rhs.type.shape:
-            return lhs, rhs
-        return broadcast(self, lhs, rhs)
+        left, right = lhs.type, rhs.type
+        if left.is_block() == right.is_block():
+            alike = not left.is_block() or left.shape is right.shape
+            return (lhs, rhs) if alike else broadcast(self, lhs, rhs)
+        return (lhs, splat(rhs, left)) if left.is_block() else (splat(lhs, right), rhs)
 
     core.block_type.__init__, core.tensor.__init__ = init_block, init_tensor
     core.block_type.with_element_ty = block_of
