@@ -28,8 +28,15 @@ def spare_repeated_work():
 
     interpreter._get_np_dtype = np_dtype
     interpreter.TensorHandle.__post_init__ = lambda _: None  # compares sizes of types
-    unwrap, plain = language.core._unwrap_if_constexpr, {language.tensor, int, float, bool, str, type(None)}
-    language.core._unwrap_if_constexpr = lambda value: value if type(value) in plain else unwrap(value)
+    unwrap = language.core._unwrap_if_constexpr
+    plain = {language.tensor, language.dtype, int, float, bool, str, type(None)}
+
+    def unwrapped(value):
+        if type(value) in plain:
+            return value
+        return value.value if type(value) is language.constexpr else unwrap(value)
+
+    language.core._unwrap_if_constexpr = unwrapped
     _remember_builtins(interpreter, language.core)
     _remember_shapes(language.core, language.semantic.TritonSemantic)
     _remember_constants(language.core, language.semantic.TritonSemantic)

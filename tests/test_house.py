@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_513,
     "datagen": 8_960,
     "tools": 6_296,
-    "tests": 37_345,
+    "tests": 37_358,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

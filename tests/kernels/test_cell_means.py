@@ -8,6 +8,8 @@ from network.states import network_of
 from hgn.network.grid import build_hierarchy
 from hgn.training.cell_means import with_means
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 
 def test_an_error_that_all_share_counts_once_more_on_each_level():
     """Errors in common are multiplied by 1 + weight times the number of levels. Opposite errors at one place are not

@@ -1,5 +1,6 @@
 """Friction of surfaces and parameters of materials as inputs: exact where they are 0; Coulomb's law for any weights."""
 
+import functools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -35,6 +36,9 @@ def own_network(seed=5, **changes):
         for parameter in network.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
     return network
+
+
+drawn_network = functools.cache(own_network)  # the same for each friction
 
 
 def rough(state, friction=1.0, seed=0):
@@ -95,7 +99,7 @@ def test_a_scene_without_friction_is_alone_in_a_batch():
 def test_the_force_of_a_floor_lies_in_its_cone(friction):
     """For 40 random networks and motions the mean force along a floor is at most mu times its push, 0 where it would
     pull; some forces are at the cone's edge, and some pull."""
-    pushes = [mean_push(own_network(seed), on_floor(friction, seed=seed)) for seed in range(40)]
+    pushes = [mean_push(drawn_network(seed), on_floor(friction, seed=seed)) for seed in range(40)]
     ratios = [float(push_3[::2].norm()) / max(friction * float(push_3[1]), 1e-15) for push_3 in pushes]
     assert max(ratios) <= 1 + 1e-12 and sum(float(push_3[1]) < 0 for push_3 in pushes) > 5
     assert friction in (0.0, 3.0) or max(ratios) > 0.98
@@ -109,7 +113,7 @@ def test_friction_slows_and_never_reverses(tilt):
     for seed in range(40):
         speed = np.random.default_rng(seed).normal(size=3) * (4e-3, 0.0, 4e-3) * (seed % 4 > 0)
         state = on_floor(0.8, velocity=tuple(speed), gravity=gravity, seed=seed)
-        along_2 = mean_push(own_network(seed), state)[::2]
+        along_2 = mean_push(drawn_network(seed), state)[::2]
         left_2 = (state.velocity_NM3[0, 0] + state.gravity_S3[0])[::2] + along_2
         sizes = float(along_2.norm() * left_2.norm())
         assert float(along_2 @ left_2) <= 1e-3 * sizes + 1e-15  # FEW leaves a part of the push in T
