@@ -1,6 +1,5 @@
 """One run of the generator on a folder, until its part of the data set is published or a stop is requested."""
 
-import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -16,7 +15,7 @@ from hgn.config import DatagenConfig
 from hgn.data.fresh import draw_fresh
 from hgn.schema import ConfigError, from_mapping, known_keys, require
 from hgn.system.machine import available_cpus, available_memory
-from hgn.system.signals import Signals
+from hgn.system.signals import ENDING, Signals
 
 _SECTIONS = ("scene", "mpm", "dataset")
 # keys of the command that belong to the section `dataset`, with their names there
@@ -32,8 +31,8 @@ _OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
 
 def stop_signals() -> Signals:
-    """Returns a record of Ctrl-C and SIGTERM, so that current writes are finished."""
-    return Signals(numbers=(signal.SIGINT, signal.SIGTERM))
+    """Returns a record of signals, so that current writes are finished."""
+    return Signals(numbers=ENDING)
 
 
 def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> DatagenConfig:

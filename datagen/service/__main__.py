@@ -70,10 +70,11 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
             every_second = None if page is None else telling(page, app)
             server = make_server(app, service.connections, allow_open_files(_OPEN_FILES), every_second=every_second)
 
-            def end() -> None:
+            def end(_: object = None) -> None:
                 server.should_exit = True
 
             supervisor.on_unusable = end
+            stop.call(end)
             if supervisor.unusable is None:
                 host, port, *_ = listener.getsockname()
                 host = f"[{host}]" if ":" in host else host

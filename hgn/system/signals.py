@@ -31,7 +31,7 @@ class Signals:
         self,
         first: Callable[[int], None] = nothing,
         again: Callable[[int], None] = interrupt,
-        numbers: tuple[signal.Signals, ...] | None = None,  # None: those of ENDING that are not ignored (nohup)
+        numbers: tuple[signal.Signals, ...] | None = None,  # None: those of ENDING that are not ignored
     ) -> None:
         self.received: list[int] = []
         self._first, self._again, self._numbers, self._since = first, again, numbers, 0.0
@@ -41,10 +41,17 @@ class Signals:
         main = threading.current_thread() is threading.main_thread()
         self._before = {number: signal.getsignal(number) for number in self._numbers or ENDING if main}
         for number, handler in [*self._before.items()]:
-            if handler is None or (handler == signal.SIG_IGN and self._numbers is None):  # None: not of Python
+            ignored = handler == signal.SIG_IGN and (self._numbers is None or number == signal.SIGHUP)  # nohup
+            if handler is None or ignored:  # None: not of Python
                 del self._before[number]
             else:
                 signal.signal(number, self._receive)
+
+    def call(self, first: Callable[[int], None]) -> None:
+        """Sets the function for the first signal, and calls it if there was one."""
+        self._first = first
+        for number in self.received[:1]:
+            first(number)
 
     def __enter__(self) -> "Signals":
         self.listen()

@@ -329,6 +329,28 @@ def test_what_cannot_be_served(monkeypatch, capsys, tmp_path, folder):
     assert "train-000000-000001.tar must be a complete tar" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize("numbers", [[signal.SIGTERM], [signal.SIGTERM, signal.SIGHUP], [signal.SIGHUP] * 2])
+def test_signals_end_the_service(monkeypatch, tmp_path, early, numbers):
+    """Also before the server runs, and a closed terminal. No signal interrupts the end."""
+
+    class Server:
+        should_exit = False
+
+        def __init__(self, *_, **__):
+            if early:
+                list(map(signal.raise_signal, numbers))
+
+        def run(self, sockets):
+            if not early:
+                list(map(signal.raise_signal, numbers))
+            assert self.should_exit
+
+    monkeypatch.setattr(datagen.service.server, "make_server", Server)
+    monkeypatch.setattr(Supervisor, "_run", lambda _: None)
+    assert run_service([f"out={tmp_path}", "port=0", "progress=off"], monkeypatch) == 128 + numbers[0]
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
     """After SIGTERM the service ends with code 143 and stops its pool. No process remains, and no file is incomplete.
