@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from queue import SimpleQueue
@@ -56,8 +55,7 @@ class LocalWorker(Worker):
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
         super().__init__()
-        with _terminal_signals_blocked():
-            self.process, self.connection = start_child(_run, target, *arguments)
+        self.process, self.connection = start_child(_run, target, *arguments)
         self.idle = True
 
     def give(self, message: object) -> None:
@@ -119,8 +117,7 @@ class LocalWorkerFactory:
 
 
 def _run(connection: Connection, target: Callable[..., None], *arguments: Any) -> None:
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     send = _Sender(connection)
     with Signals(lambda number: sys.exit(128 + number), numbers=(signal.SIGTERM,)), _errors_sent(send):
         target(connection, send, *arguments)
@@ -290,15 +287,3 @@ def _received(connection: Connection) -> Iterator[Any]:
             yield connection.recv()
         except ENDED:
             return
-
-
-@contextlib.contextmanager
-def _terminal_signals_blocked() -> Iterator[None]:
-    # A child inherits the mask, so only the parent handles Ctrl-C, which reaches the whole process group.
-    # Starting the resource tracker unblocks the signal, so it is started first.
-    resource_tracker.ensure_running()
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous)

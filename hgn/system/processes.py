@@ -8,6 +8,7 @@ import signal
 import subprocess
 from collections.abc import Callable, Sequence
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, BinaryIO
@@ -66,12 +67,18 @@ def start_child(
 ) -> tuple[SpawnProcess, Connection]:
     """Starts `target(connection, *arguments)` in a new process, and returns it with this end of the connection.
 
-    The child gets the signal `number` when this process ends. It is spawned, because a forked Taichi hangs.
+    The child gets the signal `number` when this process ends. SIGINT is blocked in it, because Ctrl-C reaches the whole
+    process group. It is spawned, because a forked Taichi hangs.
     """
+    resource_tracker.ensure_running()  # its start unblocks the signal
     context = multiprocessing.get_context("spawn")
     connection, child = context.Pipe(duplex)
     process = context.Process(target=_run, args=(target, number, child, *arguments), daemon=daemon)
-    process.start()
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
     child.close()
     return process, connection
 

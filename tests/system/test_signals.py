@@ -13,6 +13,7 @@ from hgn.render.exchange import save_frames
 from hgn.scene import rollout_file, simulated_frames
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.system import files, signals
+from hgn.system.processes import start_child
 
 FRAMES, STRIDE = 4, 23  # of the lines between two tested ones
 PLACES = {module.__file__ for module in (exchange, rollout_file, simulated_frames, files, signals)}
@@ -55,6 +56,17 @@ def frames_in(folder):
 def still():
     """A rollout of which no frame was simulated."""
     return Rollout(np.zeros((FRAMES, 5, 3), np.float32), np.zeros(5, np.uint8), (), (1.0, 1.0, 1.0), 60.0)
+
+
+def report(connection):
+    connection.send(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+
+
+def test_children_get_no_signals_of_the_terminal():
+    """Ctrl-C reaches the whole process group. A child that starts printed a traceback, and its parent replaced it."""
+    process, connection = start_child(report)
+    assert connection.recv() == {signal.SIGINT}
+    process.join()
 
 
 @pytest.mark.parametrize("numbers", [[signal.SIGINT] * 2, [signal.SIGTERM, signal.SIGINT, signal.SIGTERM]])
