@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -364,14 +364,9 @@ class Launch(ABC):
         frames = len(trajectory[0])
         every = [slice(*pair) for pair in pairwise(self.particle_begin)]
         first = [slice(particles.start, particles.stop, children) for particles in every]
-        for rows, scene, visible in zip(trajectory, self.scenes, first, strict=True):
-            rows[0] = scene.position_N3[::children]
-            rows[0, self.entry_frame[visible] > 0] = np.nan
         last = np.concatenate([scene.position_N3 for scene in self.scenes])
-        if on_frame is not None:
-            on_frame(0)
-        present, completed = 1, np.zeros(len(self.scenes), np.int64)
-        for position, completed in self._advance(frames - 1):
+        present, start = 0, (last[None], np.zeros(len(self.scenes), np.int64))
+        for position, completed in chain([start], self._advance(frames - 1)):
             for rows, visible in zip(trajectory, first, strict=True):
                 rows[present : present + len(position)] = position[:, visible]
                 for frame in range(present, min(present + len(position), self.entry_frame[visible].max())):

@@ -157,13 +157,14 @@ class GroupEntry(MaterialEntry):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = [name for name in ("shape", "size", "position") if getattr(self, name) is not None]
-        if self.particles is not None:
-            for name in given:
-                require(False, name, "left out with particles", getattr(self, name))
-            return
         for name in ("shape", "size", "position"):
-            require(name in given, name, "given", None, "or give particles, a file")
+            given = getattr(self, name)
+            if self.particles is None:
+                require(given is not None, name, "given", None, "or give particles, a file")
+            else:
+                require(given is None, name, "left out with particles", given)
+        if self.particles is not None:
+            return
         require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
         rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
         require(isinstance(self.size, tuple) == (self.shape == "box"), "size", rule, self.size)

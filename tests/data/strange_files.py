@@ -1,5 +1,6 @@
 """Files of at most 12 MB that claim far more than they hold: weights, meshes and scenes."""
 
+import functools
 import json
 import math
 import os
@@ -200,6 +201,7 @@ def no_instances(header):
     header["scenes"][0]["nodes"] = list(range(10))
 
 
+@functools.cache
 def spiral(count):
     """The lines of one polygon, most of whose ears contain another corner."""
     turns = [(index, 1.0) for index in range(count)] + [(index, 1.1) for index in reversed(range(count))]
