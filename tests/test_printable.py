@@ -13,22 +13,27 @@ from hgn.schema import ConfigError, from_mapping, printable
 
 # control and format characters, and separators of lines, paragraphs and words
 KINDS = ("Cc", "Cf", "Zl", "Zp", "Zs")
-UNSEEN = [chr(code) for code in range(sys.maxunicode + 1) if unicodedata.category(chr(code)) in KINDS]
-UNSEEN = [*(character for character in UNSEEN if character not in " \n"), "\ud800", "\ue000", "\U0010ffff"]
 BIDI = "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 
 
-def test_no_unseen_character_is_shown():
+@pytest.fixture(scope="module")
+def unseen():
+    """Characters of these kinds, and others without a picture."""
+    characters = [chr(code) for code in range(sys.maxunicode + 1) if unicodedata.category(chr(code)) in KINDS]
+    return [*(character for character in characters if character not in " \n"), "\ud800", "\ue000", "\U0010ffff"]
+
+
+def test_no_unseen_character_is_shown(unseen):
     """Each is shown by its number, also between others and after letters."""
     for before, after in (("", ""), ("a", "b"), ("\x1b", "\u202e")):
-        for character in UNSEEN:
+        for character in unseen:
             shown = printable(before + character + after)
             assert shown.isprintable() and shown != before + after, ascii(character)
 
 
-def test_cards_show_no_unseen_character():
+def test_cards_show_no_unseen_character(unseen):
     """Nor as a number that a browser turns into the character."""
-    for character in UNSEEN:
+    for character in unseen:
         shown = _plain(f"a{character}b")
         assert shown.isprintable() and f"&#{ord(character)};" not in shown, ascii(character)
 

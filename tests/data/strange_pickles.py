@@ -117,7 +117,7 @@ cases(
         ),
         "bytearray": pickled(called(bytearray, 10**11)),
         "a key of tuples": pickled(key_of_tuples()),
-        "keys of one hash": pickled(keys_of_one_hash()),
+        "keys of one hash": lambda folder: pickled(keys_of_one_hash())(folder),
         "tuples of one hash": lambda folder: pickled(keys_of_one_hash(tuples=True))(folder),
         "an ordered dict of pairs": lambda folder: pickled(keys_of_one_hash(tuples=True, called=True))(folder),
         "operations": lambda folder: pickled(b"\x80\2" + 1_000_000 * b"N0" + b"}.")(folder),
