@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_528,
+    "hgn": 35_539,
     "datagen": 8_940,
     "tools": 6_296,
     "tests": 37_399,

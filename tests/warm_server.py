@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 
 PRELOADED = (
-    *("lightning.pytorch", "lightning.pytorch.loggers", "tensorboard.compat.proto.summary_pb2", "hydra", "h5py"),
+    *("hgn.training.lightning_compat", "tensorboard.compat.proto.summary_pb2", "hydra", "h5py"),
     *("torch.distributed.run", "torch.distributed.elastic.rendezvous.c10d_rendezvous_backend", "scipy.spatial"),
     *("torch.distributed.algorithms.ddp_comm_hooks.debugging_hooks", "hgn.hydra_compat", "hgn.training.monitor"),
     *("hgn.rollout", "hgn.evaluate", "hgn.export", "hgn.train", "hgn.training.session", "hgn.training.tensorboard"),

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
 from tqdm import tqdm
 
 from hgn.data.storage import StorageError
@@ -34,6 +33,7 @@ from hgn.training.dataset import LONG_ON_A_CPU_S, WAY_OUT
 from hgn.training.distributed import checksum, same_on_all_ranks
 from hgn.training.errors import format_ratio
 from hgn.training.gradients import take_counters
+from hgn.training.lightning_compat import Callback, LightningModule, Trainer
 from hgn.training.module import TrainingModule
 from hgn.training.schedule import log_line_due, measurement_due
 from hgn.training.stop import BY_WEIGHT, StopRequest

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
 from hgn.schema import ConfigError
@@ -20,6 +19,7 @@ from hgn.system.files import make_folder, temporary_file, write_atomically
 from hgn.system.locks import make_again
 from hgn.system.patience import outlived
 from hgn.training.checkpoint import LAST_NAMES, SAVED, DamagedError, Progress, read_checkpoint
+from hgn.training.lightning_compat import TorchCheckpointIO
 
 TURN_S = 1e-4  # Python's switch interval during pickling of a checkpoint; the default is 5e-3
 

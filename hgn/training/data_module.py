@@ -8,7 +8,6 @@ from itertools import islice
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningDataModule, Trainer
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import WindowChunk
@@ -17,6 +16,7 @@ from hgn.data.pooled import AnyStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.schema import ConfigError
 from hgn.system.patience import standard_patience_s, without_patience
+from hgn.training.lightning_compat import LightningDataModule, Trainer
 from hgn.training.pushforward import Starts, drawn_starts
 from hgn.training.readers import ChunkReader, DrawnChunk
 from hgn.training.schedule import next_measurement

@@ -1,4 +1,4 @@
-"""All private and fragile parts of Lightning that this project uses; pyproject.toml bounds its version.
+"""All that this project uses of Lightning, with its private and fragile parts; pyproject.toml bounds its version.
 
 `tests/training/test_lightning_compat.py` fails when a new version changes one of them.
 """
@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 # Lightning needs two classes of torchmetrics for metrics, which this project logs itself. torchmetrics imports SciPy's
-# signal processing and Matplotlib, which takes as long as all of PyTorch. Import this module before Lightning.
+# signal processing and Matplotlib, which takes as long as all of PyTorch. Other modules import Lightning from here.
 if "torchmetrics" not in sys.modules:
     sys.modules["torchmetrics"] = metrics = ModuleType("torchmetrics")
     metrics.__dict__.update(__version__="1.0.0", Metric=type("Metric", (), {}), MetricCollection=type("", (), {}))
@@ -22,8 +22,17 @@ if "torchmetrics" not in sys.modules:
 
     del sys.modules["torchmetrics"]  # a logger may need all of it
 
+from lightning.fabric.loggers import Logger as Logger
+from lightning.fabric.loggers import TensorBoardLogger as TensorBoardLogger  # the other one writes empty hparams.yaml
+from lightning.fabric.plugins import TorchCheckpointIO as TorchCheckpointIO
+from lightning.pytorch import Callback as Callback
+from lightning.pytorch import LightningDataModule as LightningDataModule
+from lightning.pytorch import LightningModule as LightningModule
 from lightning.pytorch import Trainer
 from lightning.pytorch import seed_everything as seed_everything
+from lightning.pytorch.loggers import Logger as TrainerLogger  # noqa: F401
+from lightning.pytorch.loggers import MLFlowLogger as MLFlowLogger
+from lightning.pytorch.loggers import WandbLogger as WandbLogger
 from lightning.pytorch.plugins.environments import (
     ClusterEnvironment,
     LightningEnvironment,

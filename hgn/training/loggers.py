@@ -12,14 +12,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from lightning.fabric.loggers import Logger, TensorBoardLogger  # Lightning's other one writes an empty hparams.yaml
-from lightning.pytorch.loggers import Logger as TrainerLogger
-from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
-
 from hgn.schema import printable
 from hgn.system.files import write_atomically
 from hgn.system.patience import standard_patience_s
 from hgn.system.ranks import first_rank
+from hgn.training.lightning_compat import Logger, MLFlowLogger, TensorBoardLogger, TrainerLogger, WandbLogger
 
 PROJECT = "hgn"  # project in W&B and experiment in MLflow, unless the environment names another
 MOST_WAITING = 10_000  # calls that wait for a logger; later ones are dropped

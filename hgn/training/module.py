@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import WindowChunk
@@ -17,6 +16,7 @@ from hgn.runtime.backend import build, fastest_stepped
 from hgn.runtime.torch_backend import Backend
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import AVERAGED, NETWORK, SECTION, DataInfo, Progress
+from hgn.training.lightning_compat import LightningModule
 from hgn.training.pushforward import SimulationStoppedError
 from hgn.training.schedule import learning_rate
 from hgn.training.torch_updates import TorchUpdates

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hgn.data.pooled import AnyStore
 from hgn.render.pictures import rollout_of_episode
@@ -30,6 +29,7 @@ from hgn.training.errors import (
     one_step_errors,
     rollout_errors,
 )
+from hgn.training.lightning_compat import Callback, LightningModule, Trainer
 from hgn.training.module import TrainingModule
 from hgn.training.schedule import measurement_due
 from hgn.training.stop import StopRequest

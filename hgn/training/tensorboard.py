@@ -4,14 +4,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lightning.fabric.loggers import TensorBoardLogger
-from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
 from PIL import Image
 
 from hgn.render.error_curve import error_curve
 from hgn.render.pictures import animate, compare_picture, write_picture
 from hgn.scene.rollout_file import Rollout
+from hgn.training.lightning_compat import (
+    Callback,
+    LightningModule,
+    MLFlowLogger,
+    TensorBoardLogger,
+    Trainer,
+    WandbLogger,
+)
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import NoReturn
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hgn.command import EXIT_MACHINE
 from hgn.system.files import write_atomically
+from hgn.training.lightning_compat import Callback, LightningModule, Trainer
 from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT
 

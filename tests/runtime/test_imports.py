@@ -77,7 +77,7 @@ def test_simulating_loads_no_training_stack(tmp_path):
 
 def test_lightning_without_metrics(tmp_path):
     """A training imports Lightning without torchmetrics, SciPy and Matplotlib. Others can still import torchmetrics."""
-    program = "import sys; from hgn.training.lightning_compat import Trainer; print(sorted(sys.modules), end='|')"
+    program = "import sys; from hgn.training.monitor import Monitor; print(sorted(sys.modules), end='|')"
     loaded, other = printed_by(f"{program}; import torchmetrics; print(torchmetrics.__file__)", folder=tmp_path).split(
         "|"
     )
