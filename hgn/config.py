@@ -362,8 +362,9 @@ class TrainingConfig:
     noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
     # fraction of the noise's variance in waves of 4 to 64 cells, which neighbours have in common; the paper's is 0
     noise_correlated_fraction: Fraction[float] = 0.1
-    # fraction of an episode's samples drawn in proportion to their frames' acceleration, with loss weights that keep
-    # the expected loss; 0: all frames are equally likely
+    # domain units per frame squared; frames of smaller rms acceleration a have this / a as loss weight, at most 4
+    quiet_acceleration: NonNegative[float] = 0.0
+    # fraction of samples drawn in proportion to their frames' acceleration, with loss weights for the expected loss
     frame_importance: BelowOne[float] = 0.0
     # folders of additional data sets, as published when the command starts. They need the same physics, frame rate,
     # solver cells and reference grid, known materials, and with absolute inputs the same gravity.
@@ -379,8 +380,7 @@ class TrainingConfig:
     pushforward_every: Positive[int] = 500  # number of updates between these simulations
     pushforward_scenes: Positive[int] = 64  # scenes simulated together on each device, from random frames of the data
     pushforward_frames: Positive[int] = 16  # number of simulated frames, at most to the end of the episode
-    # simulated frames as a fraction of the episode's, if that is more than pushforward_frames; slow drifts show only in
-    # long simulations
+    # least number of simulated frames, as a fraction of the episode's; slow drifts show only in long simulations
     pushforward_episode_fraction: BelowOne[float] = 0.0
     # fraction of these samples drawn in proportion to their target acceleration, with loss weights that keep the
     # expected loss; 0: all are equally likely
@@ -436,7 +436,7 @@ class TrainConfig:
         mirrors, symmetry = self.network.relative and not self.step.rests, self.training.symmetry
         rule = "gravity with relative inputs and step.rest_threshold=0, which simulate mirrored frames"
         require(symmetry == "gravity" or not mirrors, "training.symmetry", rule, symmetry)
-        weight = self.training.cell_mean_weight if self.network.kind == "gns" else 0
+        weight = (self.network.kind == "gns") * self.training.cell_mean_weight
         require(weight == 0, "training.cell_mean_weight", "0 for gns, which has no cells", weight)
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} if training.pushforward_fraction > 0"

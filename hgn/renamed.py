@@ -47,7 +47,6 @@ REMOVED: dict[str, Removed] = {
     "network.static_spacing_cells": Removed(remedy=f"leave it out; {LAST_COMMIT}"),
     "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW),
     "training.noise_min_scale": Removed(1.0, "leave it out: all frames have equal noise"),
-    "training.quiet_acceleration": Removed(remedy="write training.cell_mean_weight=2.0"),
     "training.pushforward_pull": Removed(remedy="leave it out: it is 0.1"),
 }
 

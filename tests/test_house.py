@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_539,
+    "hgn": 35_558,
     "datagen": 8_940,
     "tools": 6_296,
-    "tests": 37_399,
+    "tests": 37_416,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -1,7 +1,8 @@
 """Input noise and grid jitter (paper sec. 3.3), each drawn from the sample's own seed.
 
 Backend torch draws the noise in this module (`perturbed_window`, called by hgn.training.torch_updates). Backend triton
-draws it in hgn.kernels.update (`Updates._assemble`, kernels `draw_waves` and `assemble_batch`).
+draws it in hgn.kernels.update (`Updates._assemble`, kernels `draw_waves` and `assemble_batch`). `quiet_weight` returns
+a sample's loss weight for both backends.
 Shape legend: W = m + 2 window frames (m velocities), N particles, F windows, S scenes, K waves.
 """
 
@@ -9,11 +10,25 @@ import math
 
 import torch
 
-from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES
+from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
 
 # Keys of the other random streams. Without a key these would repeat the numbers of the particles' noise.
 JITTER_STREAM, WAVE_STREAM = 0x5DEECE66D, 0x2545F4914F
+
+SMALLEST_ACCELERATION = 1e-30  # avoids a division by 0
+QUIET_WEIGHT = 4.0  # largest loss weight of a frame below training.quiet_acceleration
+
+
+def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
+    """Returns the loss weight of a sample whose target has this root mean square.
+
+    Errors at rest are much smaller than errors of impacts, so they hardly change the mean loss. But they are the same
+    in every frame, so resting bodies creep over thousands of frames.
+    """
+    if not acceleration < training.quiet_acceleration:
+        return 1.0
+    return min(QUIET_WEIGHT, training.quiet_acceleration / max(acceleration, SMALLEST_ACCELERATION))
 
 
 def target_acceleration(window_FWN3: torch.Tensor) -> torch.Tensor:

@@ -32,7 +32,7 @@ from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import corners_at_rest
 from hgn.schema import ConfigError, Vector
-from hgn.training.noise import target_acceleration
+from hgn.training.noise import quiet_weight, target_acceleration
 from hgn.training.pushforward_targets import pushforward_windows
 
 E = TypeVar("E")  # an episode as a backend reads it
@@ -202,8 +202,10 @@ class PushforwardPool(Generic[E, T]):
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
         """Returns the samples, some replaced by samples of the pool, each with the seed of the sample it replaces."""
         samples, scenes = list(samples), self._scenes
-        for slot, (number, weight) in enumerate(self._draws.drawn(update)):
-            samples[slot] = scenes.drawn(self._samples[number][0], samples[slot].seed, weight)
+        for slot, (number, draw_weight) in enumerate(self._draws.drawn(update)):
+            simulated, acceleration = self._samples[number]
+            weight = draw_weight * quiet_weight(self.training, acceleration)
+            samples[slot] = scenes.drawn(simulated, samples[slot].seed, weight)
         return samples
 
     def _by_frames(self, starts: Sequence[tuple[E, int]]) -> list[tuple[int, list[tuple[E, int]]]]:

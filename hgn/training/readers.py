@@ -17,6 +17,7 @@ from hgn.data.sampler import BLOCK_EPISODES, Sample, SamplerState
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.step_config import UNCONSTRAINED, StepConfig
+from hgn.training.noise import quiet_weight
 from hgn.training.pushforward import Starts, simulated_barrier
 
 REMEMBERED_SCENES = 1024  # number of episodes whose rest shapes stay in memory
@@ -39,12 +40,12 @@ class ChunkReader(Protocol):
 
 
 class FrameDraws:
-    """Draws a sample's frame by importance."""
+    """Draws a sample's frame by importance, and its loss weight by the frame's acceleration."""
 
     def __init__(self, store: AnyStore, training: TrainingConfig) -> None:
         self._store, self._training = store, training
         self._importance: dict[int, FrameImportance] = {}
-        self.measures_frames = training.frame_importance > 0
+        self.measures_frames = training.frame_importance > 0 or training.quiet_acceleration > 0
 
     def measured(self, episode: Episode) -> FrameImportance | None:
         """Returns an episode's accelerations; None if no setting depends on them."""
@@ -57,6 +58,7 @@ class FrameDraws:
 
     def drawn(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
         """Returns the samples with the drawn frames and loss weights."""
+        fraction = self._training.frame_importance
         if not self.measures_frames:
             return tuple(samples)
         drawn = []
@@ -64,7 +66,8 @@ class FrameDraws:
             if sample.episode not in self._importance:
                 self.add(sample.episode, self.measured(self._store.read(sample.episode)))
             importance = self._importance[sample.episode]
-            frame, weight = importance.draw(sample.frame, sample.seed)
+            frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
+            weight *= quiet_weight(self._training, importance.accelerations[frame])
             drawn.append(sample._replace(frame=frame, weight=weight))
         return tuple(drawn)
 

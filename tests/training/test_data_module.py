@@ -32,11 +32,12 @@ def episodes_of(folder, training, **options):
     return EpisodeDataModule(store, training, EpisodeReader(store, SETTINGS[0], training), **options)
 
 
-@pytest.mark.parametrize("importance", [0.0, 0.5])
-def test_resident_feeding_equals_streaming(folder, importance):
+@pytest.mark.parametrize(("importance", "quiet"), [(0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0)])
+def test_resident_feeding_equals_streaming(folder, importance, quiet):
     """Whole episodes in a GPU's memory contain bitwise the same windows as streaming, for samples with the same order,
     seeds and weights. Each episode is sent once, and the cursors agree at the end of every chunk."""
-    network, training = SETTINGS[0], replace(SETTINGS[1], frame_importance=importance)
+    changes = {"frame_importance": importance, "quiet_acceleration": quiet}  # nothing accelerates as much
+    network, training = SETTINGS[0], replace(SETTINGS[1], **changes)
     expected = list(islice(windows_of(folder, training).chunks(), UPDATES))
     resident: dict[int, EpisodeTensors] = {}
     update = 0
@@ -53,7 +54,9 @@ def test_resident_feeding_equals_streaming(folder, importance):
             assert torch.equal(torch.cat([resident[s.episode].material_N for s in samples]).long(), batch.material_N)
             assert tuple(sample.seed for sample in samples) == batch.seeds_S
             assert tuple(sample.weight for sample in samples) == batch.weight_S
-            assert (batch.weight_S == (1.0, 1.0)) == (importance == 0)
+            assert (batch.weight_S == (1.0, 1.0)) == (importance == quiet == 0)
+            if importance == 0:
+                assert batch.weight_S == ((4.0, 4.0) if quiet else (1.0, 1.0))
             update += 1
         if update == UPDATES:
             break

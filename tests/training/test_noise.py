@@ -4,14 +4,16 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from scene.test_episode import make_episode
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import make_batch
 from hgn.training.noise import (
     jittered_origin,
     perturbed_window,
+    quiet_weight,
     random_walk,
     target_acceleration,
 )
@@ -131,3 +133,12 @@ def test_what_is_asked_for():
     still_7N3 = window_7N3[:, [1, 1, 1, 1]] + time[:, None, None]
     found = target_acceleration(torch.stack([window_7N3, still_7N3]))
     torch.testing.assert_close(found, torch.tensor([0.6 / 12**0.5, 0.0]))
+
+
+def test_what_rests_counts_more():
+    """Below `quiet_acceleration` the loss weight of a sample is the ratio of this value to its acceleration, at most
+    QUIET_WEIGHT. By default all weights are 1."""
+    quiet = TrainingConfig(quiet_acceleration=1e-3)
+    asked = (1.0, 1e-3, 5e-4, 1e-4, 1e-6, 0.0)
+    assert [quiet_weight(quiet, acceleration) for acceleration in asked] == pytest.approx([1, 1, 2, 4, 4, 4])
+    assert quiet_weight(quiet, float("nan")) == quiet_weight(TrainingConfig(), 0.0) == 1.0
