@@ -8,8 +8,8 @@ import struct
 
 import numpy as np
 import torch
-import trimesh
 from safetensors.torch import save
+from scene.test_glb import box_with
 
 from hgn.config import NetworkConfig
 from hgn.render.renderer import Stage, smooth_normals
@@ -82,15 +82,7 @@ cases(
 
 def glb(change):
     def make(folder):
-        content = trimesh.creation.box().export(file_type="glb")
-        length = struct.unpack("<I", content[12:16])[0]
-        header = json.loads(content[20 : 20 + length])
-        change(header)
-        text = json.dumps(header).encode()
-        text += b" " * (-len(text) % 4)
-        rest = content[20 + length :]
-        chunk = struct.pack("<II4s", 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
-        (folder / "m.glb").write_bytes(struct.pack("<4sI", b"glTF", 2) + chunk)
+        (folder / "m.glb").write_bytes(box_with(change))
         return folder / "m.glb"
 
     return make

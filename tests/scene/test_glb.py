@@ -16,6 +16,23 @@ CUBE = trimesh.creation.box(bounds=((0, 0, 0), (1, 1, 1)))
 QUAD = np.array([(0, 2, 0), (1, 2, 0), (1, 2, 1), (0, 2, 1)], np.float32)
 
 
+def glb_bytes(tree, data):
+    """A GLB file of a header and its numbers."""
+    chunks = b""
+    for kind, pad, content in ((b"JSON", b" ", json.dumps(tree).encode()), (b"BIN\0", b"\0", data)):
+        content += pad * (-len(content) % 4)
+        chunks += struct.pack("<I4s", len(content), kind) + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def box_with(change):
+    """A box as GLB, whose header is changed."""
+    content = trimesh.creation.box().export(file_type="glb")
+    end = 20 + int.from_bytes(content[12:16], "little")
+    change(tree := json.loads(content[20:end]))
+    return glb_bytes(tree, content[end + 8 :])
+
+
 class Glb:
     """Writes a GLB file from arrays."""
 
@@ -49,11 +66,7 @@ class Glb:
 
     def save(self, path, **more):
         tree = self.tree | {"buffers": [{"byteLength": len(self.data)}], "scenes": [{"nodes": self.roots()}]} | more
-        text = json.dumps(tree).encode()
-        text += b" " * (-len(text) % 4)
-        data = self.data + b"\0" * (-len(self.data) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
-        path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        path.write_bytes(glb_bytes(tree, self.data))
         return path
 
     def roots(self):

@@ -3,12 +3,10 @@
 import contextlib
 import errno
 import io
-import json
 import os
 import pickle
 import resource
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
@@ -23,6 +21,7 @@ from data.foreign_writers import metadata, sequence_example, write
 from data.test_index import shard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scene.test_glb import box_with
 from scene.test_rollout_file import make_rollout
 
 from datagen.solve import SolveConfig
@@ -132,14 +131,8 @@ def test_meshes_that_are_not_read(tmp_path, uri):
     folder.mkdir()
     os.mkfifo(folder / "pipe")
     (tmp_path / "outside.bin").write_bytes(bytes(1000))
-    content = trimesh.creation.box().export(file_type="glb")
-    length = struct.unpack("<I", content[12:16])[0]
-    header = json.loads(content[20 : 20 + length])
-    header["buffers"][0]["uri"] = uri
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    chunk = struct.pack("<4sI", b"glTF", 2) + struct.pack("<II4s", 20 + len(text), len(text), b"JSON") + text
-    (folder / "mesh.glb").write_bytes(content[:4] + bytes(1) + content[5:] if uri is None else chunk)
+    content = box_with(lambda tree: uri is None or tree["buffers"][0].update(uri=uri))
+    (folder / "mesh.glb").write_bytes(content[:4] + bytes(1) + content[5:] if uri is None else content)
     reason = ".*at most 4,096 characters" if uri and len(uri) > 100 else ""
     with pytest.raises(ConfigError, match="mesh must be a readable GLB file" + reason):
         load_mesh(folder / "mesh.glb")
