@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_558,
     "datagen": 8_940,
     "tools": 6_296,
-    "tests": 37_416,
+    "tests": 37_418,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

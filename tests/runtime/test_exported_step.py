@@ -1,5 +1,6 @@
 """Tests a step as ONNX and as a compiled package: other programs compute the same as this one."""
 
+import gc
 import json
 import os
 import re
@@ -114,7 +115,9 @@ def one_turn():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hgn.step.reference.SURFACES", 1)
         patch.setattr("hgn.step.reference.REST_SIZES", 1)
+        gc.disable()  # an export's graphs are looked through again and again
         yield
+        gc.enable()
 
 
 @pytest.fixture(autouse=True, scope="module")
