@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_558,
     "datagen": 8_940,
     "tools": 6_296,
-    "tests": 37_418,
+    "tests": 37_420,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 
@@ -171,6 +171,8 @@ def test_docstrings_start_with_a_verb():
     counts = dict.fromkeys(PACKAGES, 0)
     for package in PACKAGES:
         for name in in_packages(f"{package}/"):
+            if re.search("[\"']" + HEADLESS.pattern, (ROOT / name).read_text(encoding="utf-8")) is None:
+                continue  # parsing takes a hundred times as long
             nodes = (node for node in ast.walk(tree(name)) if isinstance(node, (ast.FunctionDef, ast.ClassDef)))
             texts = (ast.get_docstring(node, clean=False) or "" for node in nodes)
             counts[package] += sum(HEADLESS.match(text) is not None for text in texts)
