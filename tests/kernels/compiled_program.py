@@ -64,7 +64,7 @@ constrained = StepConfig(0.3, (0.02, 0.04), 1e-3)
 near = replace(relative, obstacle_distance=True, own_physics=("friction", "moving"))
 for seeing, step in ((relative, StepConfig()), (relative, constrained.in_training), (near, constrained)):
     of_relative |= frame_of(seeing, step, "fp16", (9000, 3000, 900), scenes=2, particles=9000)[0]
-training = replace(settings, precision="fp16")
+training = replace(settings, precision="fp16", symmetry="gravity")
 of_relative |= launches_of(TrainConfig(network=near, training=training), False, (9000, (9000, 3000, 900)))
 
 network = NetworkConfig(levels=1, message_passing_steps=1)
