@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 35_558,
     "datagen": 8_940,
-    "tools": 6_296,
-    "tests": 37_420,
+    "tools": 6_304,
+    "tests": 37_428,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -13,7 +13,7 @@ import torch.distributed as dist
 
 from hgn.schema import ConfigError, from_mapping
 from tools.scaling import measure
-from tools.scaling.command import main
+from tools.scaling.command import main, training_of
 from tools.scaling.config import ScalingConfig
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
@@ -103,6 +103,14 @@ def test_triton_is_timed_alike(alone):
     for contender in (plain, fast):
         contender.update.run()
     assert float(fast.update.weights().norm()) == pytest.approx(float(plain.update.weights().norm()), rel=1e-4)
+
+
+@pytest.mark.parametrize("inputs", ["absolute", "relative", "local"])
+def test_kernels_of_networks_with_any_inputs_are_compiled(inputs):
+    """The training whose kernels are compiled ahead has the measured network, without symmetries."""
+    config = from_mapping(ScalingConfig, {"network": {"inputs": inputs}})
+    job = training_of(config)
+    assert job.network == config.network and job.training.symmetry == "none"
 
 
 def test_devices_that_are_not_there(monkeypatch):

@@ -11,6 +11,7 @@ import torch.multiprocessing
 
 from hgn.config import SceneConfig, TrainConfig, TrainingConfig
 from hgn.schema import from_mapping, require
+from hgn.step_config import StepConfig
 from hgn.system.files import write_json
 from tools import report
 from tools.report import EXIT_RED, PASS
@@ -42,6 +43,15 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
     return "cuda", wanted
 
 
+def training_of(config: ScalingConfig) -> TrainConfig:
+    """Returns a training with the kernels of the measured updates."""
+    training = TrainingConfig(batch_scenes=config.scenes, precision=config.precision, noise_correlated_fraction=0.0)
+    scene = SceneConfig(obstacle_count=0)  # for any network
+    # Without the rest constraint relative inputs need symmetry, and the measured updates have none.
+    step = StepConfig(rest_threshold=0.1 * config.network.relative)
+    return TrainConfig(scene, network=config.network, training=training, step=step, imported=True)
+
+
 def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
     """Fills Triton's cache, because each process would compile for minutes."""
     if device_type == "cpu" or "triton" not in config.backends or torch.version.hip is not None:
@@ -49,9 +59,7 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
     # Triton, which backend torch does without, is loaded here.
     from hgn.training.precompile import Precompilation
 
-    training = TrainingConfig(batch_scenes=config.scenes, precision=config.precision, noise_correlated_fraction=0.0)
-    scene = SceneConfig(obstacle_count=0)  # for any network
-    job = TrainConfig(scene, network=config.network, training=training, imported=True)
+    job = training_of(config)
     with Precompilation(job, torch.cuda.get_device_capability(), count > 1) as precompilation:
         print(precompilation.wait(), file=sys.stderr)
 
