@@ -221,7 +221,7 @@ MISTAKES = [
     ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got 1329"),
     (BOMB, ALIASES),
     ("groups: &a [*a]", ALIASES),
-    ("groups: [" + 120_000 * "1," + "]", ALIASES),
+    ("groups: [&a [" + 400 * "1," + "]" + 250 * ",*a" + "]", ALIASES),
     (ONE_CUBE + "seed: 1\n" + ONE_CUBE, r"line 4: the key groups is given twice, first in line 1"),
     (ONE_CUBE.replace("size: 0.05", "size: 0.05, size: 0.1"), "line 2: the key size is given twice, first in line 2"),
     ("\ufeff" + ONE_CUBE.replace("\n", "\r\n") + "seed: 1\r\nseed: 2\r\n", "line 4: the key seed is given twice"),
