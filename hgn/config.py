@@ -436,8 +436,8 @@ class TrainConfig:
         mirrors, symmetry = self.network.relative and not self.step.rests, self.training.symmetry
         rule = "gravity with relative inputs and step.rest_threshold=0, which simulate mirrored frames"
         require(symmetry == "gravity" or not mirrors, "training.symmetry", rule, symmetry)
-        weight = (self.network.kind == "gns") * self.training.cell_mean_weight
-        require(weight == 0, "training.cell_mean_weight", "0 for gns, which has no cells", weight)
+        weight, cells = self.training.cell_mean_weight, self.network.kind != "gns"
+        require(cells or weight == 0, "training.cell_mean_weight", "0 for gns, which has no cells", weight)
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} if training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)

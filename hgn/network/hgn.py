@@ -113,7 +113,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
     @property
     def images(self) -> bool:
         """Returns whether simulations predict their frames in images (hgn.network.images)."""
-        return self.config.relative and self.origin_range > 0
+        return self.config.relative and not self.step.rests
 
     def origin(self, state: ParticleState) -> torch.Tensor:
         """Returns the origins of the grids of scenes at their frames, [S, 3]."""

@@ -384,8 +384,8 @@ class Updates:
             self.grid.build(self.buffers)
             self.capacities = self._rounded(self.grid.needed_L.tolist())
         self.grid = self._device_grid(self.capacities)
-        sums = self.grid.more_cleared[0] if self.training.cell_mean_weight > 0 else torch.empty(0, device=device)
-        self.sum_C4 = sums.view(torch.float32).view(-1, 4)  # sums of errors in the cells of all levels
+        # sums of errors in the cells of all levels; no rows without training.cell_mean_weight
+        self.sum_C4 = self.grid.more_cleared[0].view(torch.float32).view(-1, 4)
         # The gradients of a mean over particles are small. float16 would round them to zero without a scale.
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         self.fused = FusedTrainingNetwork(
@@ -395,8 +395,8 @@ class Updates:
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
         config, (lower, upper) = self.config, self._reach
         window = Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
-        more = (4 * sum(capacities),) if self.training.cell_mean_weight > 0 else ()
-        return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device, more)
+        sums = 4 * sum(capacities) * (self.training.cell_mean_weight > 0)
+        return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device, more=(sums,))
 
     def _make_room(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
