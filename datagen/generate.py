@@ -13,19 +13,14 @@ from datagen.pool.worker_plan import plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
 from hgn.data.fresh import draw_fresh
+from hgn.renamed import removed_remedy
 from hgn.schema import ConfigError, from_mapping, known_keys, require
 from hgn.system.machine import available_cpus, available_memory
 from hgn.system.signals import ENDING, Signals
 
 _SECTIONS = ("scene", "mpm", "dataset")
 # keys of the command that belong to the section `dataset`, with their names there
-_OF_DATASET = {
-    "scenes": "training_scenes",
-    "out": "folder",
-    "pool": "pool",
-    "array_task": "array_task",
-    "array_tasks": "array_tasks",
-}
+_OF_DATASET = {"scenes": "training_scenes", "out": "folder"}
 # experiment files serve all commands; these keys are ignored, because only hgn.train needs them
 _OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
@@ -41,9 +36,10 @@ def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> Da
     Raises: ConfigError, also for a key that is neither a generator's nor one of `others`, which the caller reads.
     """
     names = (*_SECTIONS, *_OF_DATASET, *_OTHERS, *others)
-    for key in mapping:
+    for key, value in mapping.items():
         if key not in names:
-            raise ConfigError(f"{key} is not a known key; {known_keys(key, names)}")
+            remedy = removed_remedy("datagen", key, value) or known_keys(key, names)
+            raise ConfigError(f"{key} is not a known key; {remedy}")
     sections = {name: mapping[name] for name in _SECTIONS if name in mapping}
     dataset = {name: mapping[key] for key, name in _OF_DATASET.items() if key in mapping}
     config = from_mapping(DatagenConfig, sections | {"dataset": {**mapping.get("dataset", {}), **dataset}})

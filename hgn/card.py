@@ -37,7 +37,6 @@ class CardConfig:
     data: str | None = None  # folder of a data set, whose card is written instead of a card of weights
     out: str | None = None  # the folder for the card and a copy of the weights; only with weights
     license: str = "mit"  # name of the licence on the Hub
-    name: str | None = None  # heading; null: name of the file or the folder
 
     def __post_init__(self) -> None:
         one = (self.weights is None) != (self.data is None)
@@ -57,7 +56,7 @@ def main(mapping: dict[str, Any]) -> int:
         assert config.out is not None  # checked by CardConfig
         path, folder = find_weights(config.weights), Path(config.out)
         _, info = load_weights(path)
-        text = weights_card(info, config.name or path.stem, path.name, config.license)
+        text = weights_card(info, path.stem, path.name, config.license)
         copy, content = folder / path.name, path.read_bytes()
         same = not copy.exists() or read_replaced(copy) == content
         require(same, "out", f"a folder without another {path.name}", str(folder))
@@ -67,7 +66,7 @@ def main(mapping: dict[str, Any]) -> int:
         folder = Path(config.data)
         manifest = Manifest.load(folder)
         with errors_in_config(folder):
-            text = data_card(manifest, config.name or folder.name, config.license)
+            text = data_card(manifest, folder.name, config.license)
     target = folder / CARD
     require(not target.exists(), "out" if config.weights else "data", f"a folder without {CARD}", str(folder))
     folder.mkdir(parents=True, exist_ok=True)

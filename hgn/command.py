@@ -198,8 +198,7 @@ def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:
     """Returns the configurations of the command line. With `complete=False` required keys may be missing."""
     from hgn.hydra_compat import compose
 
-    arguments = _with_json_as_override(sys.argv)
-    folder = _folder(config_name)
+    arguments, folder = sys.argv, _folder(config_name)
     _require_options(arguments, lambda: compose(folder, config_name, arguments[:1], complete=False)[0])
     return compose(folder, config_name, [a for a in arguments if a not in ("--help", "-h")], complete)
 
@@ -238,20 +237,6 @@ def _require_options(arguments: list[str], settings: Callable[[], dict[str, Any]
             raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; {SHOW_KEYS}")
         for item in re.split(r"[\[\]{},]", value if "://" not in value else ""):
             require(is_path(item), name.lstrip("+"), PATH_RULE, item, "choose a shorter one")
-
-
-def _with_json_as_override(arguments: list[str]) -> list[str]:
-    """Replaces the options `--json FILE` and `--json=FILE` of the reports by json=FILE."""
-    result: list[str] = []
-    waiting = iter(arguments)
-    for argument in waiting:
-        if argument == "--json":
-            file = next(waiting, None)
-            require(file is not None, "--json", "followed by a file name", file, "as in --json bench.json")
-            result.append(f"json={file}")
-        else:
-            result.append(argument.removeprefix("--") if argument.startswith("--json=") else argument)
-    return result
 
 
 def _fail(message: str, code: int) -> int:

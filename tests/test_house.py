@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_558,
-    "datagen": 8_940,
+    "hgn": 35_545,
+    "datagen": 8_935,
     "tools": 6_304,
-    "tests": 37_429,
+    "tests": 37_428,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -28,7 +28,7 @@ class ReportConfig:
     """The options that reports have in common."""
 
     device: str = "auto"  # or cpu, cuda, cuda:1
-    json: FileName | None = None  # file for the rows; --json FILE does the same
+    json: FileName | None = None  # file for the rows
 
 
 def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
-from hgn.schema import Bounded, ConfigError, Port, Positive, from_mapping
+from hgn.schema import Bounded, ConfigError, Port, from_mapping
 from hgn.system.machine import allow_open_files
 
 if TYPE_CHECKING:
     from datagen.pool.worker import Backend
 
 _OPEN_FILES = 65536
-_SERVICE_KEYS = ("host", "port", "health_port", "connections")
+_SERVICE_KEYS = ("host", "port", "health_port")
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,6 @@ class ServiceConfig(Bounded):
     host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
     health_port: Port | None = None  # second port for /healthz, which answers even if the service is busy; null: no
-    connections: Positive[int] = 1024  # limit of connections; a further one closes the oldest idle one, or gets a 503
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
@@ -68,7 +67,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
                 folder, token, lambda: replace(supervisor.state, log_error=log.error or supervisor.state.log_error)
             )
             every_second = None if page is None else telling(page, app)
-            server = make_server(app, service.connections, allow_open_files(_OPEN_FILES), every_second=every_second)
+            server = make_server(app, open_files=allow_open_files(_OPEN_FILES), every_second=every_second)
 
             def end(_: object = None) -> None:
                 server.should_exit = True

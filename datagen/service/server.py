@@ -260,7 +260,7 @@ def telling(page: HealthPage, app: Starlette) -> Callable[[], Awaitable[None]]:
 
 def make_server(
     app: ASGIApp,
-    connections: int,
+    connections: int = SendfileProtocol.most_connections,
     open_files: int = OPEN_FILES,
     patience_s: float = SendfileProtocol.patience_s,
     every_second: Callable[[], Awaitable[None]] | None = None,

@@ -149,9 +149,6 @@ def test_commands_compose():
         if not arguments or {"--help", "--config-dir"} & set(arguments):
             continue  # what is composed of a tutorial's own file, test_tutorials runs
         folder = ROOT / "conf" / ("command" if (ROOT / "conf" / "command" / f"{name}.yaml").is_file() else "")
-        if "--json" in arguments:
-            at = arguments.index("--json")
-            arguments[at : at + 2] = [f"json={arguments[at + 1]}"]
         with initialize_config_dir(str(folder), version_base="1.3"):
             compose(folder, name, arguments)
 

@@ -25,7 +25,7 @@ from hgn.schema import from_mapping
 
 K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
 OLDEST, NEWEST = "1.31", "1.37"
-SERVICE_KEYS = ("host", "port", "health_port", "connections")
+SERVICE_KEYS = ("host", "port", "health_port")
 # keys of each part of a RayJob; + stands before those that must be there
 RAY = {
     "": "+apiVersion +kind +metadata +spec",

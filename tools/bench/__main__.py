@@ -1,4 +1,4 @@
-"""python -m tools.bench [--json FILE]: times of a frame, a training step and the solver.
+"""python -m tools.bench [json=FILE]: times of a frame, a training step and the solver.
 
 A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows": [...]}.
 """

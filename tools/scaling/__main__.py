@@ -1,4 +1,4 @@
-"""python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices.
+"""python -m tools.scaling [json=FILE]: weak scaling of training on this machine's devices.
 
 A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows"}.
 """

@@ -103,7 +103,7 @@ def gallery_cases(case: str) -> list[Case]:
     loaded = load_gallery(case)
     draw, _, scene = case.partition(":")
     file = REFERENCE / f"{draw}_solver.json"
-    command = f"run python -m tools.stability solver 'cases=[{case}]' --json {file}"
+    command = f"run python -m tools.stability solver 'cases=[{case}]' json={file}"
     require(file.is_file(), "cases", f"{case} only where {file} has the solver's figures", case, command)
     cases = []
     with damage_named(f"{file} must be a report of tools.stability solver", command):

@@ -48,7 +48,7 @@ class StabilityNetworkConfig(SimulatorConfig, Bounded):
     solver: bool = True
     mpm: MpmConfig = field(default_factory=MpmConfig)  # the solver; its sand must be that of the network's data
     scene: SceneConfig = field(default_factory=SceneConfig)  # the scenes of the training
-    json: FileName | None = None  # file for the rows; --json FILE does the same
+    json: FileName | None = None  # file for the rows
 
 
 def main(mapping: dict[str, Any]) -> int:

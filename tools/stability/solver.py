@@ -1,4 +1,4 @@
-"""python -m tools.stability solver [--json FILE]: checks the solver against formulas and experiments.
+"""python -m tools.stability solver [json=FILE]: checks the solver against formulas and experiments.
 
 Rows: the largest stable step, stiffness, speed of impact, free flight from obstacles and friction on them, a long run,
 and published experiments (water at rest, dams, columns and slopes of sand). On two CPU cores most cases take minutes;
