@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_545,
     "datagen": 8_935,
     "tools": 6_304,
-    "tests": 37_428,
+    "tests": 37_426,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

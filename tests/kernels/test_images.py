@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import triton.language as tl
 from kernels.engines import device
 from kernels.test_origins import BACKENDS
 from kernels.test_pushforward import let_move, with_parameters
@@ -13,6 +12,7 @@ from network.states import network_of, on_device
 from training.test_symmetry import ALL_48, doubled, scene_with_obstacles
 
 from hgn.data.batch import make_batch
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.images import IMAGES
 from hgn.network.origins import frame_origin
 from hgn.runtime.simulator import Simulator
@@ -63,9 +63,7 @@ def test_a_frame_is_predicted_in_the_image_that_training_shows(distance, monkeyp
 def test_an_image_moves_as_the_image_of_the_scene(backend, monkeypatch):
     """If scene and image begin at frames with opposite images, and all frames have the same origin, the image moves as
     the scene, mirrored. With the same images they move differently."""
-    monkeypatch.setattr("hgn.network.origins.STEPS", (0, 0, 0))
-    for axis in "XYZ":
-        monkeypatch.setattr(f"hgn.kernels.step.kernel.{axis}_STEP", tl.constexpr(0))
+    monkeypatch.setattr(HierarchicalGraphNetwork, "origin_range", 0.0)
     network = network_of(torch.float32, **OWN, obstacle_distance=True, wall_clearance=NODES)
     network.normaliser.acceleration_std.fill_(0.01)
     state, image = states(network, IMAGES[1:] * 2)
