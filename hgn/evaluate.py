@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from hgn.schema import Bounded, FileName, NonNegative, Positive, from_mapping
 from hgn.system.files import require_place, write_json
 from hgn.system.loading import loading
 from hgn.system.progress import bar
+from hgn.system.signals import Signals, interrupt
 
 if TYPE_CHECKING:
     from hgn.data.batch import Batch
@@ -43,30 +44,49 @@ class EvaluateConfig(SimulatorConfig, Bounded):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if `json` is set. Returns the exit code."""
+    """Prints a table, and writes JSON if `json` is set. After a signal both have what was measured. Returns the code.
+
+    Raises: KeyboardInterrupt for a signal before the first measurement.
+    """
     with loading():
         from hgn.runtime.simulator import InitialState, Simulator
-        from hgn.runtime.weights import find_weights, require_frame_rate
-        from hgn.system.provenance import provenance
-        from hgn.training.errors import set_convention
+        from hgn.runtime.weights import require_frame_rate
 
     config = from_mapping(EvaluateConfig, mapping)
     if config.json is not None:
         require_place(Path(config.json))
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
-    info = simulator.info
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
-    require_frame_rate(info, episodes[0].frame_rate_hz)
+    require_frame_rate(simulator.info, episodes[0].frame_rate_hz)
     for episode in episodes:
         simulator.require_fits(InitialState.of_episode(episode))
-    rows = one_step_rows(simulator.backend, episodes, config)
+    with Signals() as signals:
+        _measure(config, simulator, store, episodes, signals)
+    return signals.exit_code
+
+
+def _measure(
+    config: EvaluateConfig, simulator: Simulator, store: EpisodeStore, episodes: list[Episode], signals: Signals
+) -> None:
+    from hgn.runtime.weights import find_weights
+    from hgn.system.provenance import provenance
+    from hgn.training.errors import set_convention
+
+    stop, frames = lambda: signals.requested, 1
     trials: list[RolloutResult] = []
-    if config.rollout_frames >= 2:
+    rows = one_step_rows(simulator.backend, episodes, config, stop)
+    if not rows[0]["frames"]:
+        interrupt(signals.received[0])
+    if config.rollout_frames >= 2 and not signals.requested:
         print(simulator.backend.note, file=sys.stderr)
-        trials = rollouts(simulator, episodes, config.rollout_frames)
-        rows.append(rollout_row(trials, episodes, config.rollout_frames))
+        trials, frames = rollouts(simulator, episodes, config.rollout_frames, stop)
+    if frames > 1:
+        rows.append(rollout_row(trials, episodes, frames))
     print(table(rows, config, len(episodes)))
+    measured = f"one-step errors of {rows[0]['frames']} frames, rollouts of {frames if frames > 1 else 'no'} frames"
+    if signals.requested:
+        print(f"stopped early: {measured} were measured", file=sys.stderr)
     own = None
     if episodes[0].imported:
         paths = [trial.position_TN3 for trial in trials]
@@ -79,18 +99,20 @@ def main(mapping: dict[str, Any]) -> int:
             seed = store.manifest.config["seed"]
         report = {
             "meta": provenance(simulator.device)
-            | {"weights": Path(config.weights).name, "updates": info.updates, "split": config.split}
-            | {"set": set_record(config.data, seed, [find_weights(config.weights)])},
+            | {"weights": Path(config.weights).name, "updates": simulator.info.updates, "split": config.split}
+            | {"set": set_record(config.data, seed, [find_weights(config.weights)])}
+            | ({"stopped_early": measured} if signals.requested else {}),
             "rows": rows,
         }
         if own is not None:
             report["set_convention"] = own
         write_json(config.json, report)
-    return 0
 
 
-def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
-    """Returns a row for each predictor: {"system", "one_step_mse", "by_material"}.
+def one_step_rows(
+    backend: Backend, episodes: list[Episode], config: EvaluateConfig, stop: Callable[[], bool] = lambda: False
+) -> list[dict[str, Any]]:
+    """Returns a row for each predictor: {"system", "frames" measured until `stop`, "one_step_mse", "by_material"}.
 
     If scenes are of several kinds (`scene.kinds`), the network's row also has "by_kind": {kind: {"one_step_mse",
     "fraction" of the whole squared error}}, the largest fraction first.
@@ -113,43 +135,48 @@ def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateCon
 
         for kind, of_kind in kinds.items():
             batches = counted(frame_batches(of_kind, network, config.frame_stride))
-            found = one_step_errors(predictors, batches, device, network.config.materials)
+            found = one_step_errors(predictors, batches, device, network.config.materials, stop)
             by_kind[kind] = found["network"]
             for name, error in found.items():
                 errors[name].include(error)
     rows: list[dict[str, Any]] = [
-        {"system": name, "one_step_mse": error.mse, "by_material": error.by_material()}
+        {"system": name, "frames": progress.n, "one_step_mse": error.mse, "by_material": error.by_material()}
         for name, error in errors.items()
     ]
     if len(kinds) > 1:
         whole = sum(errors["network"].total.values()) or 1.0
-        parts = sorted(((sum(e.total.values()) / whole, kind) for kind, e in by_kind.items()), reverse=True)
+        parts = sorted(((sum(e.total.values()) / whole, kind) for kind, e in by_kind.items() if e.count), reverse=True)
         rows[0]["by_kind"] = {k: {"one_step_mse": by_kind[k].mse, "fraction": part} for part, k in parts}
     return rows
 
 
-def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list[RolloutResult]:
-    """Simulates the episodes from their first frame to the last frame of the shortest one."""
+def rollouts(
+    simulator: Simulator, episodes: list[Episode], frames: int, stop: Callable[[], bool]
+) -> tuple[list[RolloutResult], int]:
+    """Simulates the episodes from their first frame to the last frame of the shortest one, or until `stop`.
+
+    Returns the rollouts and the number of frames.
+    """
     from hgn.runtime.rollouts import simulate_scenes
     from hgn.runtime.simulator import InitialState
 
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         initial = [InitialState.of_episode(episode) for episode in episodes]
-        return simulate_scenes(simulator, initial, frames, lambda _: progress.update())
+        return simulate_scenes(simulator, initial, frames, lambda _: progress.update(), stop), progress.n + 1
 
 
 def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames: int) -> dict[str, Any]:
-    """Returns {"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse",
-    "by_material", "ends"}. An error is the mean over the scenes that reached its frame."""
+    """Returns {"system", "frames", "position_mse": {frame: value}, "scenes_reached": {frame: count},
+    "mean_position_mse", "by_material", "ends"}. An error is the mean over the scenes that reached its frame."""
     from hgn.training.errors import REPORTED_FRAMES, rollout_errors
 
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
-    frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     reported = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
     reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in reported}
     return {
         "system": "network rollout",
+        "frames": frames,
         "position_mse": _at_frames(mse_T["all"], reported),
         "scenes_reached": reached,
         "mean_position_mse": float(np.nanmean(mse_T["all"])),

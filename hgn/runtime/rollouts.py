@@ -21,12 +21,16 @@ class RolloutResult:
 
 
 def simulate_scenes(
-    simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None = None
+    simulator: Simulator,
+    scenes: Sequence[InitialState],
+    frames: int,
+    on_frame: Callable[[int], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> list[RolloutResult]:
-    """Simulates scenes together. A scene that diverges ends, and the others continue."""
+    """Simulates scenes together. A scene that diverges ends, and the others continue until `stop` returns True."""
     if not scenes:
         return []
-    paths, ended = simulator.paths(scenes, frames, on_frame, isolate=True)
+    paths, ended = simulator.paths(scenes, frames, on_frame, isolate=True, stop=stop)
     return [
         RolloutResult(path_TN3[: ended[i].frame], str(ended[i])) if i in ended else RolloutResult(path_TN3)
         for i, path_TN3 in enumerate(paths)

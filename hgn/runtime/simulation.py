@@ -116,10 +116,13 @@ class Simulation(AbstractContextManager["Simulation"]):
         self._row_count += len(new.position_N3)
         self._begin(replace(old, **joined(old, entering)))
 
-    def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
+    def run(
+        self, frames: int, on_frame: Callable[[int], Any] | None = None, stop: Callable[[], bool] = lambda: False
+    ) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
 
-        Positions are NaN before a particle enters, and in ended scenes except in the frame in which a particle enters.
+        After `stop` returns True, it computes no further block of frames. Positions are NaN before a particle enters,
+        and in ended scenes except in the frame in which a particle enters.
         Raises: DivergedError without `isolate`.
         """
         first, done = self.frame, 0
@@ -131,7 +134,9 @@ class Simulation(AbstractContextManager["Simulation"]):
                 done += 1
                 if on_frame is not None:
                     on_frame(first + done)
-        return position_TN3
+            if stop():
+                break
+        return position_TN3[:done]
 
     def blocks(self, frames: int) -> Iterator[torch.Tensor]:
         """Yields positions [T, N, 3] of the next `frames` frames in blocks on the device.

@@ -290,10 +290,12 @@ class Simulator:
         frames: int,
         on_frame: Callable[[int], None] | None = None,
         isolate: bool = False,
+        stop: Callable[[], bool] = lambda: False,
     ) -> tuple[list[np.ndarray], dict[int, DivergedError]]:
         """Does the same as `rollout`, and returns the causes of divergence by scene number.
 
-        With `isolate` a diverged scene is NaN from that frame, and the others continue.
+        With `isolate` a diverged scene is NaN from that frame, and the others continue. The frames end when `stop`
+        returns True.
         """
         require_count("frames", frames, 1)
         states = initial_states(scenes)
@@ -303,7 +305,7 @@ class Simulator:
         first_N3 = np.full((len(scene_N), 3), np.nan, np.float32)
         first_N3[: len(state.position_N3)] = state.position_N3.cpu().numpy()
         with self.simulation(state, len(scene_N), isolate, entries) as simulation:
-            position_TN3 = np.concatenate([first_N3[None], simulation.run(frames - 1, on_frame)])
+            position_TN3 = np.concatenate([first_N3[None], simulation.run(frames - 1, on_frame, stop)])
         if entries:
             return [position_TN3[:, scene_N == scene] for scene in range(len(states))], simulation.ended
         ends = np.cumsum(np.bincount(scene_N, minlength=len(states)))[:-1]

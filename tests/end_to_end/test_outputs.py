@@ -1,7 +1,9 @@
 """What commands write: never over files of other programs, and only where there is space for it."""
 
 import errno
+import functools
 import itertools
+import json
 import os
 import signal
 
@@ -10,10 +12,13 @@ import pytest
 from end_to_end.places import COMMANDS, EVALUATE, OF_THE_RUN, ROLLOUT, content, refused
 from processes import exit_code
 
-from hgn import play, rollout
+from hgn import evaluate, play, rollout
 from hgn.command import EXIT_INPUT, EXIT_MACHINE
+from hgn.runtime.simulation import Simulation
 from hgn.runtime.simulator import Simulator
 from hgn.scene.rollout_file import read_rollout
+from hgn.training import errors
+from hgn.training.errors import SquaredError
 
 
 @pytest.mark.parametrize("command", ["rollout", "solve"])
@@ -157,3 +162,36 @@ def test_an_interrupted_simulation_keeps_its_frames(place, name, number, capsys,
         assert names == [name] and read_rollout(place.path("made") / name).frame_count == 3
     else:
         assert names == [*(f"a_{frame:04d}.ply" for frame in range(3)), "a_obstacle_0.ply"]
+
+
+@pytest.mark.parametrize(
+    ("number", "place_of_signal", "call", "frames"),
+    [
+        (signal.SIGINT, (SquaredError, "__init__"), 1, None),
+        (signal.SIGTERM, (SquaredError, "add"), 6, [2] * 4),
+        (signal.SIGHUP, (Simulation, "_count"), 1, [10] * 4 + [2]),
+        (signal.SIGINT, (Simulation, "_count"), 3, [10] * 4 + [4]),
+    ],
+)
+def test_an_interrupted_evaluation_keeps_its_rows(place, number, place_of_signal, call, frames, capsys, monkeypatch):
+    """After a signal the table and the file have what was measured, with the number of frames, which a line states."""
+    owner, name = place_of_signal
+    work, calls = getattr(owner, name), itertools.count(1)
+
+    def interrupted(*given):
+        if next(calls) == call:
+            signal.raise_signal(number)
+        return work(*given)
+
+    monkeypatch.setattr(owner, name, interrupted)
+    monkeypatch.setattr(errors, "frame_batches", functools.partial(errors.frame_batches, particles_per_batch=1))
+    code = exit_code(evaluate.main, "evaluate", [*EVALUATE, "rollout_frames=6", "backend=torch"], monkeypatch)
+    file, (out, error) = place.path("made/errors.json"), capsys.readouterr()
+    assert code == 128 + number
+    if frames is None:
+        assert not file.exists() and error.splitlines()[-1] == "error: interrupted"
+        return
+    report = json.loads(file.read_text())
+    assert [row["frames"] for row in report["rows"]] == frames and "nan" not in out
+    assert f"stopped early: {report['meta']['stopped_early']} were measured\n" in error
+    assert f"of {frames[0]} frames, rollouts of {frames[4] if frames[4:] else 'no'} frames" in error
