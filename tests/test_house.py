@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_545,
+    "hgn": 35_589,
     "datagen": 8_935,
     "tools": 6_304,
-    "tests": 37_426,
+    "tests": 37_467,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -5,8 +5,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from concurrent import futures
-from contextlib import contextmanager, suppress
-from functools import partial
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import torch
 from lightning_utilities.core.apply_func import apply_to_collection
 
 from hgn.schema import ConfigError
-from hgn.system.files import make_folder, temporary_file, write_atomically
+from hgn.system.files import make_folder, sync_written, temporary_file, write_atomically
 from hgn.system.locks import make_again
 from hgn.system.patience import outlived
 from hgn.training.checkpoint import LAST_NAMES, SAVED, DamagedError, Progress, read_checkpoint
@@ -40,9 +39,7 @@ class CheckpointWriter(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Returns when the checkpoint is copied. Raises: OSError if the previous write failed."""
         self.wait()
-        place = Path(path)
-        write = partial(_write, snapshot(checkpoint), place, earlier=self._earlier, rotated=[])
-        self._writing = self._thread.submit(outlived, write, place)
+        self._writing = self._thread.submit(_write, snapshot(checkpoint), Path(path), self._earlier)
 
     def load_checkpoint(self, path: Any, *given: Any, **options: Any) -> Any:
         return outlived(
@@ -84,16 +81,16 @@ def snapshot(checkpoint: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _keep_earlier(folder: Path) -> None:
-    """Renames each earlier checkpoint to the next older name. last.ckpt stays until it is replaced."""
-    for earlier, later in pairwise(reversed(LAST_NAMES)):
-        if (folder / later).exists():
-            with temporary_file(folder / earlier) as temporary:
-                try:
-                    temporary.hardlink_to(folder / later)
-                except OSError:  # a file system without hard links
-                    shutil.copyfile(folder / later, temporary)
-                temporary.replace(folder / earlier)
+@contextmanager
+def _copied(source: Path, path: Path) -> Iterator[Path]:
+    """Yields a second, temporary name of a file, or a copy, in the folder of `path`."""
+    with temporary_file(path) as temporary:
+        try:
+            temporary.hardlink_to(source)
+        except OSError:  # a file system without hard links
+            shutil.copyfile(source, temporary)
+            sync_written(temporary)
+        yield temporary
 
 
 def _identity(path: Path) -> tuple[int, int]:
@@ -118,24 +115,33 @@ def _require_none_later(checkpoint: dict[str, Any], folder: Path, earlier: set[t
                 earlier.add(identity)
 
 
-def _write(checkpoint: dict[str, Any], path: Path, earlier: set[tuple[int, int]], rotated: list[Path]) -> None:
-    """Writes a checkpoint. A repeated call with the same `rotated` completes it, and keeps the same earlier ones."""
-    make_again(path.parent.parent)
-    make_folder(path.parent)
-    _require_none_later(checkpoint, path.parent, earlier)
-    content = io.BytesIO()
-    with _short_turns():
-        torch.save(checkpoint, content)
+def _write(checkpoint: dict[str, Any], path: Path, earlier: set[tuple[int, int]]) -> None:
+    """Writes a checkpoint. Each replaced one gets the next older name, and a write that fails leaves three others."""
+    replaced: dict[Path, Path] | None = None  # copies by their names; made once, before the first is replaced
 
-    def rotate() -> None:
-        if path.name == LAST_NAMES[0] and not rotated:
-            _keep_earlier(path.parent)
-            rotated.append(path)
+    def copy() -> None:
+        nonlocal replaced
+        if replaced is None:
+            names = pairwise(path.parent / name for name in LAST_NAMES) if path.name == LAST_NAMES[0] else ()
+            replaced = {old: copies.enter_context(_copied(new, old)) for new, old in names if new.exists()}
 
-    write_atomically(path, content.getvalue(), rotate)
-    if path.name == LAST_NAMES[0]:
-        earlier.add(_identity(path))
-        (path.parent.parent / SAVED).touch()
+    def attempt() -> None:
+        make_again(path.parent.parent)
+        make_folder(path.parent)
+        _require_none_later(checkpoint, path.parent, earlier)
+        content = io.BytesIO()
+        with _short_turns():
+            torch.save(checkpoint, content)
+        write_atomically(path, content.getvalue(), copy)
+        for name, temporary in (replaced or {}).items():
+            with suppress(FileNotFoundError):  # renamed by an earlier attempt
+                temporary.replace(name)
+        if path.name == LAST_NAMES[0]:
+            earlier.add(_identity(path))
+            (path.parent.parent / SAVED).touch()
+
+    with ExitStack() as copies:
+        outlived(attempt, path)
 
 
 @contextmanager

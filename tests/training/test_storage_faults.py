@@ -292,7 +292,7 @@ def test_faults_while_a_training_waits_for_episodes(data, tmp_path, monkeypatch,
 
 def test_a_folder_of_a_run_that_fails_for_a_moment(data, tmp_path, monkeypatch):
     """Checkpoints, pictures and log lines that cannot be written are written later, each of them once."""
-    for place, name in ((checkpoint_writer, "_write"), (callbacks, "_drop_cut_line"), (monitor, "write_pictures")):
+    for place, name in ((checkpoint_writer, "make_folder"), (callbacks, "_drop_cut_line"), (monitor, "write_pictures")):
         monkeypatch.setattr(place, name, failing_at_first(getattr(place, name)))
     assert train.main(train_mapping(data, tmp_path / "run", monitor_every=100, monitor_rollout_frames=2)) == 0
     lines = [line["update"] for line in metrics(tmp_path / "run") if "loss" in line]
