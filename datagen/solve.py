@@ -16,7 +16,6 @@ from hgn.command import require_rollout_name, run_command
 from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_frames
-from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.scene.scene_notes import notes_on_files
 from hgn.schema import ConfigError, FrameCount, FrameRate, from_mapping, require_bounds, require_replaceable, to_mapping
@@ -40,32 +39,22 @@ class SolveConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Simulates the scene and writes the file. Returns the exit code.
+    """Simulates the scene, and writes its frames as they come. Returns the exit code.
 
-    Raises: ConfigError for bad input, and as `solved` does.
+    Raises: ConfigError for bad input, and for a scene that the solver cannot simulate. The file then contains the
+    frames so far, if any.
     """
     config = from_mapping(SolveConfig, mapping)
-    file = find_scene(config.scene)
+    file, rate_hz = find_scene(config.scene), config.frame_rate_hz
     out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
     require_place(out)
     require_replaceable("out", out)
     scene = load_scene(file)
-    for note in notes_on_files(scene, (config.frames - 1) / config.frame_rate_hz):
+    for note in notes_on_files(scene, (config.frames - 1) / rate_hz):
         print(note, file=sys.stderr)
-    solved(scene, config, file, out)
-    print(out)
-    return 0
-
-
-def solved(scene: Scene, config: SolveConfig, file: Path, out: Path | None = None) -> Rollout:
-    """Simulates the scene of a file, and writes its frames to `out` as they come.
-
-    Raises: ConfigError for a scene that the solver cannot simulate. `out` then contains the frames so far, if any.
-    """
     # Taichi takes seconds to import, so bad input is reported before.
     from datagen.mpm.solver import SceneFailure, simulate
 
-    rate_hz = config.frame_rate_hz
     path_TN3 = np.full((config.frames, scene.particle_count, 3), np.nan, np.float32)
     rollout = Rollout(
         path_TN3, scene.material_N, scene.obstacles, scene.domain_size, rate_hz,
@@ -86,11 +75,9 @@ def solved(scene: Scene, config: SolveConfig, file: Path, out: Path | None = Non
         if isinstance(result, SceneFailure):
             raise ConfigError(f"{file} must be a scene that the solver can simulate, got {result.cause}")
 
-    if out is None:
-        run(lambda _: None)
-    else:
-        write_frames(out, rollout, run)
-    return rollout
+    write_frames(out, rollout, run)
+    print(out)
+    return 0
 
 
 if __name__ == "__main__":

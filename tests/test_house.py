@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 35_589,
-    "datagen": 8_935,
-    "tools": 6_304,
-    "tests": 37_467,
+    "datagen": 8_922,
+    "tools": 6_275,
+    "tests": 37_443,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -4,9 +4,6 @@ A folder gets NAME.png (some frames), NAME.gif (an animation) and, with ground t
 With a file that ends in .png, .gif or .webp (half the size of GIF) only this picture is drawn; with .usdc, .usda, .usd
 or .ply the rollout is written for other programs (`surface=true`: also water as a closed surface). Further rollouts of
 the same scene (`others=[FILE,...]`) are drawn next to the first one, with the labels `names`.
-
-If `rollout` is the name of a scene in conf/gallery, the solver simulates the scene first, and `others` are weights that
-simulate it too: `python -m tools.render rollout=pool_deep 'others=[mechanics]'`.
 """
 
 import sys
@@ -24,7 +21,6 @@ from hgn.render import PLY_ENDING, pictures
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import save_rollout
 from hgn.scene.rollout_file import Rollout, read_rollout
-from hgn.scene.scene_file import load_scene, scene_files
 from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, require_replaceable
 from hgn.system.progress import bar
 
@@ -38,10 +34,8 @@ class RenderConfig:
 
     out: str  # a folder, or one file that ends in .png, .gif, .webp (animated, half as large as GIF), .usdc or .ply
     surface: bool = False  # true: USD and PLY also contain water as a closed surface
-    # file of python -m hgn.rollout; or the name of a scene in conf/gallery, which the solver simulates
-    rollout: str | None = None
-    # further rollouts of the same scene, drawn next to it for its number of frames; of a scene in conf/gallery: weights
-    others: tuple[str, ...] = ()
+    rollout: str | None = None  # file of python -m hgn.rollout or datagen.solve
+    others: tuple[str, ...] = ()  # further rollouts of the same scene, drawn next to it for its number of frames
     # labels of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
     names: tuple[str, ...] | None = None
     data: str | None = None  # folder of a data set, instead of rollout
@@ -106,15 +100,13 @@ def main(mapping: Mapping[str, Any]) -> int:
 
 def _load(config: RenderConfig) -> Versions:
     """Reads the rollouts. Raises: ConfigError if their particles or frame rates differ."""
-    scene = None
     if config.rollout is None:
         assert config.data is not None and config.episode is not None  # checked by RenderConfig
         rollout = pictures.rollout_of_episode(find_episode(config.data, str(config.episode)))
         first, label = f"episode {config.episode}", "ground truth" if config.others else ""
         truth_TN3 = rollout.position_TN3 if config.others else None
     else:
-        scene = scene_files("gallery").get(config.rollout)
-        rollout = read_rollout(config.rollout) if scene is None else solver_rollout(scene)
+        rollout = read_rollout(config.rollout)
         first, label = config.rollout, "prediction"
         truth_TN3 = rollout.reference_TN3
         if "solver" in rollout.source:
@@ -124,7 +116,7 @@ def _load(config: RenderConfig) -> Versions:
     label, *rest = names
     others = {}
     for i, (other_name, file) in enumerate(zip(rest, config.others, strict=True)):
-        other = read_rollout(file) if scene is None else weights_rollout(rollout, scene, file)
+        other = read_rollout(file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0], equal_nan=True):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
         if not np.array_equal(_corners(rollout), _corners(other)) or other.gravity != rollout.gravity:
@@ -141,27 +133,6 @@ def _load(config: RenderConfig) -> Versions:
 
 def _corners(rollout: Rollout) -> np.ndarray:
     return np.concatenate([np.zeros((0, 3)), *(obstacle.vertex_V3 for obstacle in rollout.obstacles)])
-
-
-def solver_rollout(file: Path) -> Rollout:
-    """Simulates a gallery scene with the solver. Raises: ConfigError where the solver stops."""
-    from datagen.solve import SolveConfig, solved
-    from tools.stability.gallery import load_case  # loads torch
-
-    case = load_case(file.stem, file)
-    return solved(case.scenes[0], SolveConfig(file.stem, frames=case.measure.frames), file)
-
-
-def weights_rollout(solver: Rollout, file: Path, weights: str) -> Rollout:
-    """Simulates a gallery scene with weights. Raises: ConfigError if they do not support the scene, or diverge."""
-    from hgn.runtime.divergence import DivergedError
-    from hgn.runtime.simulator import Simulator
-
-    try:
-        (position_TN3,) = Simulator.load(weights).rollout([load_scene(file)], solver.frame_count)
-    except DivergedError as error:
-        raise ConfigError(f"others must keep {file} together, got {weights}: {error}") from error
-    return replace(solver, position_TN3=position_TN3, source={"scene": file.stem, "weights": weights})
 
 
 def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:

@@ -9,12 +9,10 @@ import pytest
 import yaml
 from runtime.stability import still_weights
 
-from datagen.mpm.solver import SceneFailure
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene_file import find_scene, load_scene, scene_files
 from hgn.schema import ConfigError, from_mapping
-from tools import render
 from tools.report import finite
 from tools.scenes import filled
 from tools.stability import gallery, network, solver, solver_gallery
@@ -386,28 +384,6 @@ def test_damaged_figures(tmp_path, monkeypatch, depth, value):
     for read in (lambda: gallery_cases("gallery"), lambda: next(rows)):
         with pytest.raises(ConfigError, match=r"solver.json must be a report of .*run python -m tools.stab"):
             read()
-
-
-def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
-    """One command simulates a gallery scene with the solver and with weights, and draws both."""
-    path, weights = tiny_file(tmp_path), still_weights(tmp_path)
-    monkeypatch.setattr(render, "scene_files", lambda folder: {"tiny": path})
-
-    def falls(scenes, config, frames, rate_hz, on_frame, trajectories):
-        time_T11 = np.arange(frames)[:, None, None] / rate_hz
-        falls_T3 = 0.5 * time_T11**2 * np.array(scenes[0].gravity)
-        trajectories[0][:] = scenes[0].position_N3 + falls_T3
-        return [RolloutResult(trajectories[0])]
-
-    monkeypatch.setattr("datagen.mpm.solver.simulate", falls)
-    options = {"rollout": "tiny", "others": [weights], "out": str(tmp_path / "pictures"), "every": 5, "size": 64}
-    assert render.main(options) == 0
-    drawn = [Path(line).name for line in capsys.readouterr().out.splitlines()]
-    assert drawn == ["tiny.png", "tiny.gif", "tiny_error.png"]
-    assert render.main(options | {"others": [], "out": str(tmp_path / "solver.png")}) == 0
-    monkeypatch.setattr("datagen.mpm.solver.simulate", lambda *_, **__: [SceneFailure("burst")])
-    with pytest.raises(ConfigError, match=r"tiny.yaml must be a scene that the solver can simulate, got burst"):
-        render.main(options)
 
 
 def test_scenes_load_as_scene_files():
