@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 35_589,
-    "datagen": 8_922,
+    "datagen": 8_938,
     "tools": 6_275,
-    "tests": 37_443,
+    "tests": 37_469,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

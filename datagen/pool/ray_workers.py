@@ -5,6 +5,7 @@ through Ray's object store, so only the pool's machine needs the data set's fold
 the same version of Python. An actor waits until a machine has capacity, so machines may leave and join at any time.
 """
 
+import contextlib
 import logging
 import os
 import time
@@ -81,9 +82,8 @@ class RayWorkerFactory:
         ready, _ = self._ray.wait(list(waiting), num_returns=1, timeout=timeout)
         for ref in ready:
             worker = waiting[ref]
-            worker.answers.remove(ref)
             try:
-                kind, *values = self._ray.get(ref)
+                kind, *values = worker.take(ref)
             except self._ray.exceptions.RayError as error:
                 worker.cause = f"{type(error).__name__} on node {worker.node or 'not yet known'}"
                 # Ray reports a silent node as unavailable first, and an actor killed by its scene as dead
@@ -92,10 +92,6 @@ class RayWorkerFactory:
                 continue
             if kind == "ready":
                 (worker.node,) = values
-            elif kind == "packed":
-                key, packed = values
-                stage_parts(Path(self._config.dataset.folder), key, [packed])
-                yield worker, ("staged", key)
             else:
                 yield worker, (kind, *values)
             if not worker.answers:
@@ -104,15 +100,15 @@ class RayWorkerFactory:
     def _start(self, kind: type, *arguments: object, **options: Any) -> "RayWorker":
         # Ray neither restarts nor retries, because the pool counts a scene's deaths and replaces workers
         actor: Any = self._ray.remote(kind).options(max_restarts=0, max_task_retries=0, **options).remote(*arguments)
-        return RayWorker(self._ray, actor)
+        return RayWorker(self._ray, actor, Path(self._config.dataset.folder))
 
 
 class RayWorker(Worker):
     """Represents an actor in the pool. It is idle once the cluster has placed it on a machine."""
 
-    def __init__(self, ray: Any, actor: Any) -> None:
+    def __init__(self, ray: Any, actor: Any, folder: Path) -> None:
         super().__init__()
-        self._ray, self._actor = ray, actor
+        self._ray, self._actor, self._folder = ray, actor, folder
         self.answers = [actor.ready.remote()]
         self.node: str | None = None
         self.cause, self.silent = "", False
@@ -122,6 +118,25 @@ class RayWorker(Worker):
         count = len(message) if isinstance(message, list) else 1
         answers = self._actor.work.options(num_returns=count).remote(message)
         self.answers = answers if count > 1 else [answers]
+
+    def take(self, answer: Any) -> tuple[Any, ...]:
+        """Returns the content of a finished answer. An episode is staged. Raises: RayError."""
+        self.answers.remove(answer)
+        kind, *values = self._ray.get(answer)
+        if kind != "packed":
+            return kind, *values
+        key, packed = values
+        stage_parts(self._folder, key, [packed])
+        return "staged", key
+
+    def dismiss(self, deadline_s: float) -> None:
+        # of a launch, whose answers are finished together, the pool may have received only the first ones
+        with contextlib.suppress(self._ray.exceptions.RayError):  # the actor, or its node, has died
+            while self.answers and time.monotonic() < deadline_s:
+                ready, _ = self._ray.wait(self.answers, timeout=0, fetch_local=False)
+                if not ready:
+                    return
+                self.take(*ready)
 
     def kill(self) -> None:
         self.answers = []

@@ -108,7 +108,8 @@ class Worker(ABC):
         """Sends a worker one part of its task, for example the obstacle grid of a scene that it simulates."""
         raise NotImplementedError
 
-    def dismiss(self, deadline_s: float) -> None:  # noqa: B027 - Ray ends its actors itself
+    @abstractmethod
+    def dismiss(self, deadline_s: float) -> None:
         """Asks the worker to keep what it has simulated, and to end. Waits until then, or time.monotonic()."""
 
     @abstractmethod

@@ -4,12 +4,16 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 from processes import BALLISTIC_PATH, PATIENCE_S
 
-from datagen.pool.ray_workers import RayWorkerFactory
+from datagen.pool.ray_workers import RayWorker, RayWorkerFactory
+from datagen.pool.shard import STAGING_NAME
 from datagen.pool.worker import Backend
 from datagen.pool.worker_plan import WorkerPlan, plan_cluster, plan_workers
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
@@ -35,6 +39,28 @@ def test_lost_node(control, tmp_path):
     assert report["finished"] and report["episodes"] == 12
     assert "a worker died" in report["messages"][0] and "on node" in report["messages"][0]
     assert report["differences"] == []
+
+
+@pytest.mark.parametrize(("fault", "deadline_s", "staged"), [(4, 1e9, [0, 2]), (2, 1e9, [0]), (4, 0.0, [])])
+def test_finished_answers_are_kept_at_the_end(tmp_path, fault, deadline_s, staged):
+    """A dismissed actor's finished answers are staged, until the deadline or its death. Others are not awaited."""
+    answers = [("packed", "train-000000", b"0"), ("failed", "train-000001", "why"), ("packed", "train-000002", b"2")]
+
+    class Ray:
+        exceptions = SimpleNamespace(RayError=LookupError)
+
+        def wait(self, given, timeout, fetch_local):
+            ready = [number for number in given if number < 3][:1]
+            return ready, [number for number in given if number not in ready]
+
+        def get(self, number):
+            return answers[number] if number != fault else {}["dead"]
+
+    (tmp_path / STAGING_NAME).mkdir()
+    worker = RayWorker(Ray(), mock.Mock(), tmp_path)
+    worker.answers = [0, 1, 2, 3]
+    worker.dismiss(deadline_s and time.monotonic() + deadline_s)
+    assert sorted(path.name for path in (tmp_path / STAGING_NAME).iterdir()) == [f"train-{n:06d}.tar" for n in staged]
 
 
 def test_no_cluster(make_config, monkeypatch):
