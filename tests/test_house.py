@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 35_589,
-    "datagen": 8_938,
+    "datagen": 8_937,
     "tools": 6_275,
-    "tests": 37_469,
+    "tests": 37_517,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

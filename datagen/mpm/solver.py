@@ -22,9 +22,8 @@ from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, 
 from datagen.mpm.team_launch import MAXIMUM_PARTICLES, SHARED_BLOCKS, BlocksApartError, Team, TeamLaunch
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.emission import at_entry, require_free_entries
-from hgn.scene.material import material_index
+from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene, whole_cells
-from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
 # Number of thread blocks that run on a processor concurrently. Taichi compiles kernels for two blocks of any size: a
@@ -35,7 +34,10 @@ EVEN = 0.95  # one block per scene above this fraction of filled turns and this 
 SHARED_THREADS = 128  # threads of a block of a few scenes
 SHARED_PARTICLES = 8  # fewest particles of such a block
 LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
-WARM_SCENES = 16  # largest number of scenes in a warm-up
+# Largest number of random scenes in a warm-up. Some kinds of scenes have bodies or obstacles that others lack, and all
+# of them choose the kernels of a launch. Without kinds few scenes contain all materials and an obstacle.
+WARM_SCENES, WARM_SCENES_OF_KINDS = 4, 16
+WARM_PARTICLES = 200_000  # particles above which a warm-up has no further scenes
 USUAL_PARTICLES = 4_000  # number of particles in a random scene
 ROUNDING = 2e-6  # largest distance of a particle from the bounds of coordinates, as a fraction of the upper one
 PARTICLE_BYTES, NODE_BYTES = 340, 50  # memory of a launch's arrays
@@ -194,24 +196,21 @@ def _arrays_freed_here() -> Iterator[None]:
 
 
 def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
-    """Starts a GPU and compiles the kernels for a launch of `scenes` random scenes. Does nothing on a CPU."""
+    """Starts a GPU and compiles the kernels for a launch of `scenes` random scenes. Does nothing on a CPU.
+
+    Simulates other random scenes of these settings, because a launch's materials and obstacles choose its kernels.
+    """
     device = initialise(config.device)
     if device.kind == "cpu":
         return
-    x, y, z = scene.domain_size
-    middle = (0.5 * x, 0.5 * y, 0.5 * z)
-    obstacles = tuple(
-        shape_obstacle(shape, scene.obstacle_size[0], middle)
-        for shape in scene.obstacle_shapes[: min(scene.obstacle_count, 1)]
-    )
-    one = Scene(
-        np.full((len(scene.materials), 3), 0.25, np.float32) * np.array(scene.domain_size, np.float32),
-        np.zeros((len(scene.materials), 3), np.float32),
-        np.array([material_index(name) for name in scene.materials], np.uint8),
-        obstacles, scene.domain_size, scene.cell_size, scene.gravity,
-    )  # fmt: skip
+    drawn: list[Scene] = []
+    for seed in range(min(scenes, WARM_SCENES_OF_KINDS if scene.kinds else WARM_SCENES)):
+        with contextlib.suppress(ConfigError):  # an obstacle may not fit; makers report such scenes
+            drawn.append(generate_scene(scene, seed))
+        if sum(one.particle_count for one in drawn) > WARM_PARTICLES:
+            break
     simulate(
-        [one] * min(scenes, WARM_SCENES),
+        drawn,
         config,
         2,
         60.0,
