@@ -164,7 +164,6 @@ class MpmConfig(Bounded):
     water_tension: AtMostOne[NonNegative[float]] = 1.0
     # Viscosity in addition to that of the grid, which is larger than that of real water.
     water_viscosity_pa_s: NonNegative[float] = 0.0
-    collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient of obstacles; 0: frictionless
     # corrected, or taichi_elements: numerical choices of the paper's simulator (hgn/solver_method.py lists them).
     method: Annotated[str, one_of(*METHODS)] = "corrected"
     fixed_time_step_s: Positive[float] | None = None  # null: each scene takes steps as long as its materials allow

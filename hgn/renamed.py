@@ -40,6 +40,7 @@ REMOVED: dict[str, Removed] = {
     **{f"datagen.{key}": Removed(remedy=f"write dataset.{key}") for key in ("pool", "array_task", "array_tasks")},
     "datagen.connections": Removed(1024),
     "card.name": Removed(remedy="edit the heading of the card"),
+    "mpm.collider_friction": Removed(0.0, "write friction of each obstacle into the scene file"),
     "network.contact_forces": Removed("normal", TRAIN_ANEW),
     "network.contact_gate": Removed("cell", TRAIN_ANEW),
     "network.contact_reach_cells": Removed(3.0, TRAIN_ANEW),

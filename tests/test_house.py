@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_589,
-    "datagen": 8_937,
-    "tools": 6_275,
-    "tests": 37_517,
+    "hgn": 35_588,
+    "datagen": 8_924,
+    "tools": 6_280,
+    "tests": 37_516,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

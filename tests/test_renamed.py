@@ -28,6 +28,7 @@ ANSWERS = [
     ("network.depth", 4, f"network.depth {ALWAYS} 3 now, not 4; train other weights"),
     ("network.contact_gate", "cell", f"network.contact_gate {ALWAYS} cell now; leave it out"),
     ("training.noise_min_scale", 0.1, f"training.noise_min_scale {ALWAYS} 1.0 now, not 0.1; leave it out"),
+    ("mpm.collider_friction", 0.25, f"mpm.collider_friction {ALWAYS} 0.0 now, not 0.25; write friction of each obst"),
     ("network.static_spacing_cells", 1.0, "it was removed; leave it out; commit a0b88cb"),
     ("mpm.time_step", "fixed", "it was removed; mpm.fixed_time_step_s is null for adaptive steps"),
     ("mpm.sand_friction_law", "mohr_coulomb", "from mpm.method: mohr_coulomb with corrected, comp"),

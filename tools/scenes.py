@@ -27,6 +27,11 @@ def filled(material: int, position_N3: np.ndarray, velocity_3: Sequence[float] |
     return Scene(np.asarray(position_N3).astype(np.float32), velocity_N3, np.full(count, material, np.uint8), **more)
 
 
+def with_friction(scene: Scene, friction: float) -> Scene:
+    """Returns the scene with this friction of all obstacles."""
+    return replace(scene, obstacles=tuple(replace(obstacle, friction=friction) for obstacle in scene.obstacles))
+
+
 def joined(scenes: Sequence[Scene]) -> Scene:
     """Returns the first scene with the particles of all."""
     names = ("position_N3", "velocity_N3", "material_N")

@@ -307,11 +307,7 @@ class Launch(ABC):
 
     def _frictions(self) -> list[np.ndarray]:
         """Returns the Coulomb coefficients of each scene's obstacles, at least one entry for each scene."""
-        own = self.config.collider_friction
-        return [
-            np.array([own if o.friction is None else o.friction for o in scene.obstacles] or [own], np.float32)
-            for scene in self.scenes
-        ]
+        return [np.array([o.friction for o in scene.obstacles] or [0.0], np.float32) for scene in self.scenes]
 
     def _places(self, node_K3: np.ndarray) -> np.ndarray:
         """Returns the indices of nodes in a scene's arrays of nodes, int32 [K]."""

@@ -144,8 +144,6 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
-        if any(obstacle.friction is not None for obstacle in scene.obstacles):
-            scene = _with_known_friction(scene, config.mpm.collider_friction)
         # Makers build the collider and draw fine particles. In a solver the GPU would idle meanwhile.
         finer = replace(scene, cell_size=config.reference_cell_size)
         collider = build_collider(finer, config.mpm.choices.collider_band_cells)
@@ -159,13 +157,6 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
             return "failed", task.key, grid
         made = replace(made, obstacle_grid=grid)
     return "made", made
-
-
-def _with_known_friction(scene: Scene, default: float) -> Scene:
-    """Returns the scene with the solver's `default` in place of unset friction, so that obstacle cells can store it."""
-    frictions = (default if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles)
-    obstacles = (replace(o, friction=friction) for o, friction in zip(scene.obstacles, frictions, strict=True))
-    return replace(scene, obstacles=tuple(obstacles))
 
 
 def build_grid(task: GridTask, backend: Backend) -> BuiltGrid:

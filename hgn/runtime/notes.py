@@ -21,7 +21,7 @@ def notes_on_scene(scene: Scene, info: WeightsInfo, weights: str, duration_s: fl
     used = INPUT_PARAMETERS if "parameters" in inputs else ()
     if unused := ", ".join(name for name in scene.material_parameters if name not in used):
         yield f"no effect: {unused} of groups; {weights} simulates each material with the solver's constants"
-    frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
+    frictions = np.array([*scene.wall_friction, *(obstacle.friction for obstacle in scene.obstacles)])
     if frictions.any() and "friction" not in inputs:
         yield f"no effect: friction of surfaces; {weights} simulates that of its data, own_physics the scene's"
     density, common = scene.particles_per_cell, SceneConfig.particles_per_cell

@@ -55,7 +55,7 @@ def obstacle_of_record(record: Mapping[str, Any], name: str) -> Obstacle:
     position, rotation_33 = tuple(record["position"]), quaternion_rotation(tuple(record["quaternion"]))
     body = shape_obstacle(record["shape"], record["size"], position, rotation_33, name)
     motion = Motion.of_frames(record["keyframes"], position) if "keyframes" in record else None
-    return replace(body, friction=record.get("friction"), motion=motion)
+    return replace(body, friction=record.get("friction") or 0.0, motion=motion)
 
 
 def _is_here(record: dict[str, Any]) -> bool:

@@ -46,7 +46,7 @@ def build_obstacle_grid(
     Raises: ConfigError for a bad cell size, or for a surface that is too large to sample.
     """
     point_S3, normal_S3, friction_S = surface_samples(obstacles, cell_size, seed, domain_size)
-    known = any(obstacle.friction is not None for obstacle in obstacles)
+    known = any(obstacle.friction for obstacle in obstacles)
     return grid_of_samples(point_S3, normal_S3, cell_size, friction_S if known else None)
 
 
@@ -92,7 +92,7 @@ def surface_samples(
     """
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     sizes = np.array([len(obstacle.triangle_F3) for obstacle in obstacles], np.int64)
-    friction_F = np.repeat(np.array([obstacle.friction or 0.0 for obstacle in obstacles]), sizes)
+    friction_F = np.repeat(np.array([obstacle.friction for obstacle in obstacles]), sizes)
     # friction is a fourth coordinate, which pieces of a triangle inherit
     corner_F34 = np.concatenate([all_corners(obstacles), np.tile(friction_F[:, None, None], (1, 3, 1))], axis=2)
     if domain_size is not None:

@@ -50,7 +50,7 @@ class Obstacle:
     vertex_V3: np.ndarray  # float64, domain units
     triangle_F3: np.ndarray  # int32, indices into vertex_V3
     closed: bool
-    friction: float | None = None  # Coulomb coefficient; None: mpm.collider_friction
+    friction: float = 0.0  # Coulomb coefficient
     motion: Motion | None = None  # None: at rest
 
     @property
@@ -128,8 +128,7 @@ class Scene:
                 raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
         require_vectors(self)
         for i, obstacle in enumerate(self.obstacles):
-            fits = obstacle.friction is None or 0 <= obstacle.friction < math.inf
-            require(fits, f"obstacles[{i}].friction", "finite and >= 0", obstacle.friction)
+            require(0 <= obstacle.friction < math.inf, f"obstacles[{i}].friction", "finite and >= 0", obstacle.friction)
         for name, value in self.material_parameters.items():
             if name not in MATERIAL_PARAMETERS:
                 raise ConfigError(f"material_parameters must be among {', '.join(MATERIAL_PARAMETERS)}, got {name!r}")

@@ -74,7 +74,7 @@ class ObstacleEntry:
     size: Positive[float] | None = None  # side, diameter, or base width and height
     position: Vector | None = None  # translation of a mesh (null: none), or centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
-    friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
+    friction: NonNegative[float] | None = None  # Coulomb coefficient; null: 0
     keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; left out: the obstacle is at rest
 
     def __post_init__(self) -> None:
@@ -405,7 +405,7 @@ def _obstacles(entries: Sequence[ObstacleEntry], folder: Path) -> Iterator[tuple
                 rotation=entry.rotation,
                 surfaces=surfaces,
             )
-        yield tuple(dataclasses.replace(body, friction=entry.friction, motion=entry.motion) for body in bodies)
+        yield tuple(dataclasses.replace(body, friction=entry.friction or 0.0, motion=entry.motion) for body in bodies)
 
 
 def _require_clear(name: str, position_N3: np.ndarray, obstacles: Sequence[Obstacle], file: SceneFile) -> None:

@@ -106,7 +106,7 @@ def placed_by(
     else:
         assert entry.shape is not None and entry.size is not None
         mesh, mesh_file = shape_obstacle(entry.shape, entry.size), None
-    body = Body(entry, dataclasses.replace(mesh, friction=entry.friction), cell_size, mesh_file, most_samples)
+    body = Body(entry, dataclasses.replace(mesh, friction=entry.friction or 0.0), cell_size, mesh_file, most_samples)
     placed = PlacedObstacle(body, entry.position or (0.0, 0.0, 0.0), entry.rotation)
     _ = placed.samples
     return placed
@@ -121,7 +121,7 @@ def moved_from(before: PlacedObstacle, after: PlacedObstacle, frame_s: float) ->
     way_T3 = np.array([(0.0, 0.0, 0.0), np.subtract(after.position, before.position)])
     motion = Motion(np.array([0.0, frame_s]), way_T3, np.stack([np.eye(3), turn_33]), before.position)
     grid = grid_of_samples(*before.samples, before.body.cell_size)
-    friction_K = np.full(len(grid.cell_K3), mesh.friction or 0.0, np.float32)
+    friction_K = np.full(len(grid.cell_K3), mesh.friction, np.float32)
     moving = MovingObstacle(dataclasses.replace(grid, friction_K=friction_K), mesh.corners, motion)
     return moving if 0 < motion.fastest(mesh.vertex_V3) * frame_s <= JUMP else None
 
@@ -144,7 +144,7 @@ def _at_rest(
     """Returns the cells and corners of obstacles. While others are dragged they stay the same objects."""
     empty = (np.zeros((0, 3)), np.zeros((0, 3)))
     parts = [empty, *(obstacle.samples for obstacle in obstacles)]
-    frictions = [0.0, *(obstacle.body.mesh.friction or 0.0 for obstacle in obstacles)]
+    frictions = [0.0, *(obstacle.body.mesh.friction for obstacle in obstacles)]
     friction_S = np.repeat(frictions, [len(points) for points, _ in parts])
     point_S3, normal_S3 = (np.concatenate(part) for part in zip(*parts, strict=True))
     near = ((point_S3 >= -cell_size) & (point_S3 < np.array(domain_size) + cell_size)).all(axis=1)

@@ -83,10 +83,10 @@ def test_groups_become_particles(tmp_path):
 
 
 def test_friction_of_each_surface(tmp_path):
-    """Walls, floor and each obstacle have their own friction, kept in the specification; none is the solver's."""
+    """Walls, floor and each obstacle have their own friction, kept in the specification; by default none."""
     scene = load(tmp_path, floor_friction=0.5, wall_friction=0.1, obstacles=[CONE, {**CONE, "friction": 0.3}])
     assert scene.wall_friction == (0.1, 0.5, 0.1)
-    assert [obstacle.friction for obstacle in scene.obstacles] == [None, 0.3]
+    assert [obstacle.friction for obstacle in scene.obstacles] == [0.0, 0.3]
     assert scene.specification["floor_friction"] == 0.5
     assert scene.specification["obstacles"][1]["friction"] == 0.3
 

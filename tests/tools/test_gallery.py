@@ -12,7 +12,7 @@ from runtime.stability import still_weights
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene_file import find_scene, load_scene, scene_files
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import ConfigError, from_stored
 from tools.report import finite
 from tools.scenes import filled
 from tools.stability import gallery, network, solver, solver_gallery
@@ -333,7 +333,7 @@ def test_one_scene(tmp_path, monkeypatch, capsys):
 def test_other_settings_of_the_solver():
     """Rows that were simulated with other settings are not copied, and not dropped."""
     report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
-    mpm = from_mapping(MpmConfig, report["meta"]["solver"] | {"snow_hardening": 9.0})
+    mpm = from_stored(MpmConfig, report["meta"]["solver"] | {"snow_hardening": 9.0}, "mpm")
     chosen = {case.name: case.gallery for case in loaded()[:1]}
     rows = solver_gallery.gallery_rows("gallery", chosen, mpm, Report("solver", {}, None, scenes={}))
     with pytest.raises(ConfigError, match=r"cases must be the whole gallery where .* has other settings of the solver"):
@@ -347,7 +347,7 @@ def test_the_stored_figures_pass():
     rows = {row["case"]: row for row in report["rows"]}
     chosen = {case.name: case.gallery for case in loaded()}
     made = Report("solver", report["meta"], None, scenes={})
-    mpm = from_mapping(MpmConfig, report["meta"]["solver"])
+    mpm = from_stored(MpmConfig, report["meta"]["solver"], "mpm")
     made.add(solver_gallery.gallery_rows("gallery", chosen, mpm, made), brief=True)
     assert json.dumps(finite(made.rows)) == json.dumps(report["rows"]), "a new run would change stored rows"
     assert json.dumps(made.more["scenes"]) == json.dumps(report["scenes"])
@@ -367,7 +367,7 @@ def test_damaged_figures(tmp_path, monkeypatch, depth, value):
     """The solver's figures in another form end in one line with the command that writes them, in both commands."""
     case = loaded()[0]
     report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
-    mpm = from_mapping(MpmConfig, report["meta"]["solver"])
+    mpm = from_stored(MpmConfig, report["meta"]["solver"], "mpm")
     place, *names = report, "scenes", case.name, "series", "64", case.gallery.measure.bounds[0].key
     for name in names[: depth - 1]:
         place = place[name]

@@ -58,9 +58,7 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
         scene, members = drawn[episode.seed], members_of(episode)
         assert members_of(decode_episode(episode.key, members)) == members
         assert episode.wall_friction == scene.wall_friction
-        frictions = {
-            np.float32(obstacle.friction) for obstacle in at_rest(scene.obstacles) if obstacle.friction is not None
-        }
+        frictions = {np.float32(obstacle.friction) for obstacle in at_rest(scene.obstacles) if obstacle.friction}
         assert frictions == set(() if episode.obstacle_grid.friction_K is None else episode.obstacle_grid.friction_K)
 
     # without members of their own, obstacle cells and particles have what the solver was set to

@@ -19,7 +19,7 @@ from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import Vector
-from tools.scenes import PARTICLES_PER_CELL, filled
+from tools.scenes import PARTICLES_PER_CELL, filled, with_friction
 from tools.stability.case import Case, Outcome, Parameter
 from tools.stability.checks import interval_text
 from tools.stability.row import Row
@@ -156,7 +156,7 @@ def _of_slide(own: Parameter, seconds: float) -> Parameter:
 
 def _with(scene: Scene, parameter: str, value: float) -> Scene:
     if parameter == "friction":
-        return replace(scene, obstacles=tuple(replace(surface, friction=value) for surface in scene.obstacles))
+        return with_friction(scene, value)
     return replace(scene, material_parameters={parameter: np.full(scene.particle_count, value, np.float32)})
 
 
@@ -210,7 +210,7 @@ def _block(height: float, domain_height: float) -> Callable[[np.random.Generator
         (turn_33, down_3), middle_3 = _slope_axes(), shift_3 + np.array([0.5, height, 0.5])
         start_3 = SLOPE_START * down_3 + turn_33 @ np.array([0.0, GAP + 0.5 * size_3[1], 0.0])
         slope = shape_obstacle("square", SLOPE_SIDE, tuple(middle_3.tolist()), turn_33, "slope")
-        rough = {"domain_size": (1.0, domain_height, 1.0), "obstacles": (replace(slope, friction=0.0),)}
+        rough = {"domain_size": (1.0, domain_height, 1.0), "obstacles": (slope,)}
         return _body("snow", middle_3 + start_3 + place_N3 @ turn_33.T, **rough)
 
     return scene

@@ -19,7 +19,7 @@ from hgn.config import MpmConfig
 from hgn.scene.material import MATERIALS, PAPER_MATERIALS, SAND, SNOW
 from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
-from tools.scenes import filled, random_places
+from tools.scenes import filled, random_places, with_friction
 from tools.stability.row import Row, within
 from tools.stability.solver_scenes import ORIENTATIONS, positions
 
@@ -163,8 +163,7 @@ def acting_frictions(cases: Sequence[tuple[Setting, str, int]], friction: float,
         up = 0.5 if obstacles else 0.5 + config.wall_cells - 1 - DOMAIN_CELLS / 2
         low = (START_CELLS - SLIDING_CELLS[0] / 2, up, -SLIDING_CELLS[2] / 2)
         scene = block(setting, material, low, SLIDING_CELLS, obstacles, (SLIDING_SPEED, 0.0, 0.0), gravity)
-        scenes.append(dataclasses.replace(scene, wall_friction=(0.0, friction, 0.0)))
-    config = dataclasses.replace(config, collider_friction=friction)
+        scenes.append(dataclasses.replace(with_friction(scene, friction), wall_friction=(0.0, friction, 0.0)))
     first = round(SETTLING_S * FRAME_RATE_HZ)
     frames = 1 + round((SETTLING_S + SLIDING_S) * FRAME_RATE_HZ)
     acting = []

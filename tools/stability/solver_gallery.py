@@ -16,6 +16,7 @@ from typing import Any
 
 from datagen.fine import solver_on_grid
 from hgn.config import MpmConfig
+from hgn.renamed import current_names
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.hdf5 import damage_named
 from hgn.scene.scene import Scene
@@ -23,6 +24,7 @@ from hgn.scene.scene_file import scene_files
 from hgn.schema import require, to_mapping
 from hgn.system.machine import available_cpus
 from hgn.system.yaml_files import read_json
+from tools.scenes import with_friction
 from tools.solver_rollouts import solver_trials
 from tools.stability.broken import BROKEN, FRICTIONLESS
 from tools.stability.checks import interval_text
@@ -80,7 +82,7 @@ def _earlier(file: Path, mpm: MpmConfig, others: Collection[str]) -> dict[str, A
     """Reads an earlier report; an empty one if the solver's settings were others, unless scenes are copied from it."""
     if file.is_file():
         report: dict[str, Any] = read_json(file)
-        if without_device(report["meta"]["solver"]) == without_device(to_mapping(mpm)):
+        if without_device(current_names(report["meta"]["solver"], "mpm")) == without_device(to_mapping(mpm)):
             return report
         rule = f"the whole gallery where {file} has other settings of the solver"
         require(not others, "cases", rule, f"without {', '.join(sorted(others))}")
@@ -165,8 +167,8 @@ def _launched(
             if case.measure.far is not None:
                 jobs.append((index, "far", case.scene(cells, far=True)))
             if cells == GRID_CELLS[0] and (any(scene.wall_friction) or any(o.friction for o in scene.obstacles)):
-                smooth = tuple(replace(obstacle, friction=0.0) for obstacle in scene.obstacles)
-                jobs.append((index, FRICTIONLESS, replace(scene, obstacles=smooth, wall_friction=(0.0, 0.0, 0.0))))
+                smooth = replace(with_friction(scene, 0.0), wall_friction=(0.0, 0.0, 0.0))
+                jobs.append((index, FRICTIONLESS, smooth))
         config = solver_on_grid(mpm, 1 / cells, 1 / GRID_CELLS[0])
         frames = max(case.measure.frames for case in cases)
         trials = solver_trials([scene for *_, scene in jobs], config, frames, RATE_HZ)

@@ -17,7 +17,7 @@ from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import SAND, WATER
 from hgn.scene.scene import Obstacle, Scene
-from tools.scenes import PARTICLES_PER_CELL, filled, random_places
+from tools.scenes import PARTICLES_PER_CELL, filled, random_places, with_friction
 from tools.stability.row import Row, within
 from tools.stability.solver_scenes import positions, rms_speed
 
@@ -118,11 +118,10 @@ def columns(base: MpmConfig) -> Iterator[Row]:
 
 def column_rows(aspect: float, base: MpmConfig, cells: int) -> Iterator[Row]:
     """Yields run-out and height at the axis, in initial radii, of a column of `cells` in radius."""
-    scene = column(aspect, cells)
+    scene = with_friction(column(aspect, cells), sand_sine(base))
     duration = TIMES * math.sqrt(aspect * COLUMN_RADIUS / GRAVITY)
     angle_deg = base.sand_friction_angle_deg
-    config = dataclasses.replace(base, collider_friction=sand_sine(base))
-    path = _path(scene, config, 41, 40 / duration)
+    path = _path(scene, base, 41, 40 / duration)
     place = _above_floor(path[-1], scene.cell_size)
     distance = np.hypot(place[:, 0], place[:, 2])
     many = np.bincount(np.floor(distance).astype(int))
@@ -197,7 +196,7 @@ def reposes(base: MpmConfig) -> Iterator[Row]:
 
 def repose(angle_deg: float, start_deg: float, base: MpmConfig, cells: int) -> tuple[float, float, float]:
     """Returns the slope of sand on a platform before and after, degrees, and its final rms speed, m/s."""
-    scene = platform(start_deg, cells)
+    scene = with_friction(platform(start_deg, cells), 1.0)
     rate_hz = 30 / (REPOSE_TIMES * math.sqrt(REPOSE_LENGTH / GRAVITY))
     path = _path(scene, _sand(base, angle_deg), 31, rate_hz)
     place = path / scene.cell_size - WALL - np.array([0.0, round(PIT * cells), 0.0])
@@ -278,7 +277,7 @@ def _above_floor(position_N3: np.ndarray, cell: float) -> np.ndarray:
 
 
 def _sand(base: MpmConfig, angle_deg: float) -> MpmConfig:
-    return dataclasses.replace(base, sand_friction_angle_deg=angle_deg, collider_friction=1.0)
+    return dataclasses.replace(base, sand_friction_angle_deg=angle_deg)
 
 
 def _path(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = DAM_RATE_HZ) -> np.ndarray:
