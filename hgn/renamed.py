@@ -39,6 +39,7 @@ REMOVED: dict[str, Removed] = {
     **{f"mpm.{key}": Removed(value) for key, value in CONSTANTS.items()},
     **{f"datagen.{key}": Removed(remedy=f"write dataset.{key}") for key in ("pool", "array_task", "array_tasks")},
     "datagen.connections": Removed(1024),
+    "import.format": Removed(remedy="leave it out: the files determine it"),
     "card.name": Removed(remedy="edit the heading of the card"),
     "mpm.collider_friction": Removed(0.0, "write friction of each obstacle into the scene file"),
     "network.contact_forces": Removed("normal", TRAIN_ANEW),

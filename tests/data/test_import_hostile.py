@@ -13,7 +13,7 @@ from data.test_import import TYPES, options
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from hgn import import_trajectories
-from hgn.data.foreign.formats import set_info
+from hgn.data.foreign.formats import find_format, set_info
 from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.tfrecord import read_records
 from hgn.schema import ConfigError
@@ -239,6 +239,14 @@ def test_malformed_files_are_refused(name, change, message, tmp_path):
     with pytest.raises(ConfigError, match=message):
         import_trajectories.main(options(tmp_path / "mine", source))
     assert not (source / "ran").exists() and not (tmp_path / "mine").exists()
+
+
+def test_files_of_several_formats_are_refused(tmp_path):
+    """The files determine the format, so a folder has those of one."""
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train.tfrecord").touch()
+    with pytest.raises(ConfigError, match=r"from must be a folder with files of one format, got .deepmind and neuralm"):
+        find_format(tmp_path)
 
 
 @pytest.mark.parametrize("types", [[1, 7, 1], [1, 5, 1], None])

@@ -20,7 +20,7 @@ NAMED = [{"particle_type": types, "position": position} for position, types in P
 
 def read(folder):
     (folder / "metadata.json").write_text(json.dumps(METADATA))
-    name = find_format(folder, "auto")
+    name = find_format(folder)
     return list(read_split(folder, "train", set_info(folder, name, ImportConfig(out="mine"))))
 
 

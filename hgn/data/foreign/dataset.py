@@ -43,7 +43,7 @@ def import_set(
     """
     out = Path(config.out)
     require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this one contains a data set")
-    info = set_info(source, find_format(source, config.format), config)
+    info = set_info(source, find_format(source), config)
     first = list(itertools.islice(read_split(source, "train", info), LOOKED_AT))
     require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
     for trajectory in first:

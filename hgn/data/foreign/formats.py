@@ -37,8 +37,8 @@ _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
 _LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # 5 to 7: its copies of DeepMind's sets
 
 
-def find_format(folder: Path, required: str) -> str:
-    """Returns the format of a folder's files. Raises: ConfigError if none of them has the `required` format."""
+def find_format(folder: Path) -> str:
+    """Returns the format of a folder's files. Raises: ConfigError for no format, or several."""
     require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
     formats = []
     if _file(folder, "train", ".tfrecord"):
@@ -54,13 +54,10 @@ def find_format(folder: Path, required: str) -> str:
         formats.append("lagrangebench" if bench else "plain")
     names = "train.tfrecord, train.npz, train.h5 or train/sim_0.h5"
     require(bool(formats), "from", f"a folder with {names}", str(folder), "see docs/how_to/import.md")
-    if required == "auto":
-        require(len(formats) == 1, "format", f"one of {', '.join(formats)}, the formats in {folder}", required)
-        return formats[0]
-    alike = {"lagrangebench", "plain"}  # formats with the same files
-    fits = required in formats or (required in alike and bool(alike & set(formats)))
-    require(fits, "format", " or ".join(formats), required)
-    return required
+    remedy = "move the files of the others to another folder"
+    several = f"{' and '.join(formats)} in {folder}"
+    require(len(formats) == 1, "from", "a folder with files of one format", several, remedy)
+    return formats[0]
 
 
 def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:

@@ -1,10 +1,9 @@
 """Settings of an import."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
 
 from hgn.scene.material import MATERIAL_NAME
-from hgn.schema import FolderName, OneOrMore, Positive, one_of, require, require_bounds
+from hgn.schema import FolderName, OneOrMore, Positive, require, require_bounds
 
 
 @dataclass(frozen=True)
@@ -12,8 +11,6 @@ class ImportConfig:
     """`python -m hgn.import_trajectories`, which also takes `from`: the folder to read."""
 
     out: FolderName  # a new folder for the data set
-    # file format; auto: recognised by the files
-    format: Annotated[str, one_of("auto", "deepmind", "geoelements", "lagrangebench", "neuralmpm", "plain")] = "auto"
     history: OneOrMore = 5  # frames before frame 0, at least network.velocity_history
     # names by particle type, as in {7: goop}, in addition to the format's
     materials: dict[str, str] = field(default_factory=dict)
