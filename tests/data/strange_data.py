@@ -282,11 +282,11 @@ cases(
 # shards
 
 
-def tar_headers(kind, count, size=b"00000000001"):
-    """Headers of one kind, with a block each."""
+def tar_headers(kind, count, size=b"00000000001", content=bytes(512)):
+    """Headers of one kind, with a content each."""
     head = b"a".ljust(100, b"\0") + b"0000644\0" + b"0000000\0" * 2 + size + b"\0" + b"0" * 11 + b"\0"
     head += b" " * 8 + kind + bytes(355)
-    return saved("a.tar", count * (head[:148] + f"{sum(head):06o}\0 ".encode() + head[156:] + bytes(512)) + bytes(1024))
+    return saved("a.tar", count * (head[:148] + f"{sum(head):06o}\0 ".encode() + head[156:] + content) + bytes(1024))
 
 
 def pax(name, value):
@@ -308,6 +308,7 @@ cases(
         "long names": tar_headers(b"L", 900),
         "a long name": tar_headers(b"L", 1, b"77777777777"),
         "pax heads": tar_headers(b"x", 900),
+        "digits of a head": tar_headers(b"x", 1, b"%011o" % 900_096, 900_096 * b"9"),
         "a large head": tar_headers(b"x", 1, b"77777777777"),
         **{
             f"{name} of a head": pax(name, value)

@@ -14,7 +14,7 @@ assert strange_data and strange_scenes  # which add their files to CASES
 READ = {  # files that hold what they claim
     "mesh: primitives", "mesh: instances", "mesh: targets", "mesh: obj of polygons",
     "mesh: cloud of triangles", "mesh: obj of groups", "mesh: obj of pentagons", "mesh: obj of a spiral",
-    "mesh: obj of materials", "mesh: stl of solids", "mesh: ply of short lists", "rollout: attributes", "tar: links",
+    "mesh: obj of materials", "mesh: stl of solids", "mesh: ply of short lists", "rollout: attributes",
     "particles: a longer stream",
     "picture: fan", "picture: 50 large triangles",
     "scene: sheet of 9000", "scene: larger obstacle", "scene: keyframes",
