@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 35_585,
     "datagen": 8_924,
-    "tools": 6_280,
+    "tools": 6_279,
     "tests": 37_525,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config

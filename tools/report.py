@@ -27,7 +27,7 @@ EXIT_RED = 1
 class ReportConfig:
     """The options that reports have in common."""
 
-    device: str = "auto"  # or cpu, cuda, cuda:1
+    device: str = "auto"  # auto (a GPU if there is one), cpu, cuda or cuda:1
     json: FileName | None = None  # file for the rows
 
 

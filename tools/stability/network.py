@@ -15,8 +15,8 @@ from hgn.config import DEFAULT_WEIGHTS, MpmConfig, SceneConfig, SimulatorConfig
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.scene import Scene
-from hgn.schema import Bound, Bounded, ConfigError, FileName, FrameCount, Vector, from_mapping, to_mapping
-from tools.report import meta_of
+from hgn.schema import Bound, Bounded, ConfigError, FrameCount, Vector, from_mapping, to_mapping
+from tools.report import ReportConfig, meta_of
 from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut, gallery_cases
 from tools.stability.checks import gallery_rows, refused, row_of
@@ -32,7 +32,7 @@ CaseName = Annotated[
 
 
 @dataclass(frozen=True)
-class StabilityNetworkConfig(SimulatorConfig, Bounded):
+class StabilityNetworkConfig(SimulatorConfig, ReportConfig, Bounded):
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
@@ -48,7 +48,6 @@ class StabilityNetworkConfig(SimulatorConfig, Bounded):
     solver: bool = True
     mpm: MpmConfig = field(default_factory=MpmConfig)  # the solver; its sand must be that of the network's data
     scene: SceneConfig = field(default_factory=SceneConfig)  # the scenes of the training
-    json: FileName | None = None  # file for the rows
 
 
 def main(mapping: dict[str, Any]) -> int:
