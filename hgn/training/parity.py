@@ -60,7 +60,7 @@ def require_update_parity(
         moving = moving if symmetries is None else moving_under(moving, symmetries)
         state = replace(state, moving=moving.to(updates.device))
     output_N3, decoded_NK = _predicted(network, state, origin_S3)
-    weight_N3 = output_N3.detach().sign() * updates.share_N[:count, None]
+    weight_N3 = output_N3.detach().sign() * updates.loss_weight_N[:count, None]
     (weight_NK,) = torch.autograd.grad(output_N3, decoded_NK, weight_N3, retain_graph=True)
     expected = _gradients(network, decoded_NK, weight_NK)
     output_error = require_parity(

@@ -46,8 +46,8 @@ def test_the_kernels_have_the_loss_and_the_gradient_of_the_reference(bodies, mon
         position_N3, scene_N, buffers.origin_S3.cpu(), updates.config.cell_size, updates.config.levels, bodies
     )
     error_N3 = output_N3 - updates.target_N3[:count].cpu()
-    share_N = updates.share_N[:count].cpu().double()
-    loss = ((error_N3 * with_means(error_N3, grid, 3.0)).mean(-1) * share_N).sum()
+    loss_weight_N = updates.loss_weight_N[:count].cpu().double()
+    loss = ((error_N3 * with_means(error_N3, grid, 3.0)).mean(-1) * loss_weight_N).sum()
     (expected_N3,) = torch.autograd.grad(loss, output_N3)
     found_N3 = updates.fused.output_gradient[:count, :3].cpu().double() * updates.fused.unscale
     torch.testing.assert_close(found_N3, expected_N3, rtol=1e-4, atol=1e-6 * float(expected_N3.abs().max()))

@@ -40,7 +40,7 @@ ELSEWHERE = {
     *("sum_motion", "deform", "prepare_relative_features"),
     *("sum_coarsest", "balance", "balance_backward", "add_coarsest"),
     *("sum_displacements", "find_deformation", "slow_displacements", "stop_slow"),
-    *("draw_waves", "assemble_batch", "sum_errors", "sum_errors_above", "loss_gradient", "tell_overflow"),
+    *("draw_waves", "assemble_batch", "sum_errors", "sum_errors_above", "loss_gradient", "flag_overflow"),
     *("square_norm", "average_values"),
     *("finish_update", "adam", "momentum_directions", "step_blocks", "integrate", "advance"),
 }

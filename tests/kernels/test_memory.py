@@ -30,7 +30,7 @@ def test_the_checker_sees_what_has_gone():
     updates = updates_of(network, 1, capacities=(64,))
     made, _ = episode(1, 5, False)
     gone = replace(made, position_TN3=made.position_TN3.clone())
-    updates.particles, updates._reach = 16, (torch.zeros(3), torch.ones(3))
+    updates.particles, updates._box = 16, (torch.zeros(3), torch.ones(3))
     for sample in (made, gone):
         updates._upload([[(sample, 1, 3)]], [1e-3])
         updates._build()

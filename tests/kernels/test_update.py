@@ -148,7 +148,7 @@ def assembled(updates, *samples, room=512):
     count = sum(sample[0].particles for sample in samples)
     if updates.particles == 0:
         updates.particles, updates.capacities = 16 * math.ceil(count / 16), (room,)
-        updates._reach = (torch.zeros(3), torch.ones(3))
+        updates._box = (torch.zeros(3), torch.ones(3))
         updates._build()
     updates._assemble()
     return updates.buffers.velocity_NV[:count].cpu().view(count, HISTORY, 3)
@@ -166,7 +166,7 @@ def test_noise_and_jitter():
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     made, still = (episode(seed, count, False, spread=0.3)[0] for seed, count in ((1, 160), (2, 120)))
     updates = updates_of(network, 2, noise_std=1e-3, jitter=True)
-    names = ("position_N3", "velocity_NV", "target_N3", "origin_S3", "share_N", "scene_N")
+    names = ("position_N3", "velocity_NV", "target_N3", "origin_S3", "loss_weight_N", "scene_N")
     drawn = []
     for seeds in ((5, 6), (5, 6), (7, 6)):
         assembled(updates, (made, 1, seeds[0]), (still, 0, seeds[1]))
@@ -176,7 +176,7 @@ def test_noise_and_jitter():
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert torch.equal(first["position_N3"][160:280], other["position_N3"][160:280])
     assert not torch.equal(first["position_N3"][:160], other["position_N3"][:160])
-    torch.testing.assert_close(first["share_N"][:280], torch.tensor([1 / 320] * 160 + [1 / 240] * 120))
+    torch.testing.assert_close(first["loss_weight_N"][:280], torch.tensor([1 / 320] * 160 + [1 / 240] * 120))
     assert first["scene_N"][:280].tolist() == [0] * 160 + [1] * 120
     assert ((first["origin_S3"] <= 0) & (first["origin_S3"] >= -0.1)).all() and first["origin_S3"].unique().numel() == 6
     window, velocity = clean(made, 1)
@@ -189,7 +189,7 @@ def test_noise_and_jitter():
     expected = network.float().normaliser.normalise_acceleration(wanted)
     torch.testing.assert_close(first["target_N3"][:160], expected, rtol=0, atol=1e-3)
     assembled(updates, DeviceSample(made, 1, 5, 4.0), DeviceSample(still, 0, 6))
-    torch.testing.assert_close(updates.share_N[:280].cpu(), torch.tensor([4 / 320] * 160 + [1 / 240] * 120))
+    torch.testing.assert_close(updates.loss_weight_N[:280].cpu(), torch.tensor([4 / 320] * 160 + [1 / 240] * 120))
 
 
 def test_a_flat_network_is_shown_no_noise_across():

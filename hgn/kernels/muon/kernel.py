@@ -9,7 +9,7 @@ from hgn.kernels.triton_compat import settle_keys
 
 @triton.jit
 def momentum_directions(
-    starts, pitch, gradient, share, first_moment, direction, status, norm, momentum, epsilon,
+    starts, pitch, gradient, rank_weight, first_moment, direction, status, norm, momentum, epsilon,
     WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Updates the momentum of square blocks (hgn.network.orthogonal), and writes Nesterov's normalised momentum.
@@ -27,7 +27,7 @@ def momentum_directions(
     row, column = tl.arange(0, WIDTH)[:, None], tl.arange(0, WIDTH)[None, :]
     place = row * WIDTH + column
     at = tl.load(starts + block) + row * tl.load(pitch + block) + column
-    g = tl.load(gradient + at) * share
+    g = tl.load(gradient + at) * rank_weight
     m = tl.load(first_moment + at)
     m += (g - m) * (1 - momentum)
     tl.store(first_moment + at, m)

@@ -40,7 +40,7 @@ class SquareBlocks:
         weights: torch.Tensor,
         momentum: torch.Tensor,
         gradient: torch.Tensor,
-        share: float,
+        rank_weight: float,
         rates: torch.Tensor,
         update: torch.Tensor,
         status: torch.Tensor,
@@ -48,10 +48,10 @@ class SquareBlocks:
         precision: str,
     ) -> None:
         """Moves the blocks of `values` and of the copy `weights`; hgn.kernels.update.kernel.adam moves the rest.
-        `share` times `gradient` is added to `momentum`."""
+        `rank_weight` times `gradient` is added to `momentum`."""
         count, width, _ = self._direction_KWW.shape
         momentum_directions[(count,)](
-            starts=self.starts, pitch=self.pitch, gradient=gradient, share=share, first_moment=momentum,
+            starts=self.starts, pitch=self.pitch, gradient=gradient, rank_weight=rank_weight, first_moment=momentum,
             direction=self._direction_KWW, status=status, norm=norm, momentum=MOMENTUM, epsilon=EPSILON,
             WIDTH=width, num_warps=WARPS,
         )  # fmt: skip

@@ -61,7 +61,7 @@ def draw_waves(
 
 @triton.jit
 def assemble_batch(
-    samples, sample_vectors, update, position, velocity, scene_of, material_of, target, share_of, origin,
+    samples, sample_vectors, update, position, velocity, scene_of, material_of, target, loss_weight_of, origin,
     domain, gravity, obstacle_table, particle_count, mean, std, noise_step, waves, jitter, scenes,
     wall_friction, parameter_of, rest_of, obstacle_cell_size,
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, NOISE: tl.constexpr, WAVES: tl.constexpr,
@@ -96,8 +96,8 @@ def assemble_batch(
             tl.store(origin + scene * 3 + axis, -jitter * draw if axis < DIMENSIONS else 0.0 * draw, mask=there)
             size = tl.load(vectors + scene * 9 + axis, mask=there, other=0.0)
             tl.store(domain + scene * 3 + axis, size, mask=there)
-            pull = tl.load(vectors + scene * 9 + 3 + axis, mask=there, other=0.0)
-            tl.store(gravity + scene * 3 + axis, pull, mask=there)
+            own_gravity = tl.load(vectors + scene * 9 + 3 + axis, mask=there, other=0.0)
+            tl.store(gravity + scene * 3 + axis, own_gravity, mask=there)
             if FRICTION:
                 rough = tl.load(vectors + scene * 9 + 6 + axis, mask=there, other=0.0)
                 tl.store(wall_friction + scene * 3 + axis, rough, mask=there)
@@ -137,7 +137,7 @@ def assemble_batch(
         value = tl.where((number < NEIGHBOURS) & (value >= 0), value + (row - own)[:, None].to(tl.int32), value)
         tl.store(rest_of + row[:, None] * PACKED + number, value, mask=written)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
-    tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
+    tl.store(loss_weight_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
     if SYMMETRY:
@@ -219,7 +219,7 @@ def sum_errors_above(sums, parent, geometry, counts, LEVELS: tl.constexpr, BLOCK
 
 @triton.jit
 def loss_gradient(
-    output, target, share_of, particle_count, gradient, loss, scale, cell_of, weight_of, sums, parent, geometry,
+    output, target, loss_weight_of, particle_count, gradient, loss, scale, cell_of, weight_of, sums, parent, geometry,
     cell_mean_weight, OUT: tl.constexpr, LEVELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the mean squared error of normalised accelerations over axes, particles and scenes, and its gradient.
@@ -238,7 +238,7 @@ def loss_gradient(
     at = row[:, None] * OUT + column[None, :]
     error = tl.load(output + at, mask=live, other=0.0)
     error -= tl.load(target + row[:, None] * 3 + column[None, :], mask=live, other=0.0)
-    share = tl.load(share_of + row, mask=row < count, other=0.0)[:, None] / 3
+    loss_weight = tl.load(loss_weight_of + row, mask=row < count, other=0.0)[:, None] / 3
     weighted = error
     for i in tl.static_range(8 if LEVELS > 0 else 0):
         cell = tl.load(cell_of + row * 8 + i, mask=row < count, other=0)
@@ -254,13 +254,13 @@ def loss_gradient(
             )
             cell = tl.load(parent + first + cell, mask=there & (level < LEVELS - 1), other=-1)
             there = there & (cell >= 0)
-    tl.store(gradient + at, 2 * scale * share * weighted, mask=(row < count)[:, None])
-    tl.atomic_add(loss, tl.sum(tl.sum(share * error * weighted, 1), 0))
+    tl.store(gradient + at, 2 * scale * loss_weight * weighted, mask=(row < count)[:, None])
+    tl.atomic_add(loss, tl.sum(tl.sum(loss_weight * error * weighted, 1), 0))
 
 
 @triton.jit
-def tell_overflow(status, flag):
-    """Writes behind the gradient whether this rank must repeat the update. The ranks exchange it with the gradient.
+def flag_overflow(status, flag):
+    """Writes after the gradient whether this rank must repeat the update. The ranks sum this flag with the gradient.
 
     Test: tests/kernels/test_ranks.py.
     """
@@ -268,21 +268,23 @@ def tell_overflow(status, flag):
 
 
 @triton.jit
-def square_norm(gradient, size, share, flag, status, norm, BLOCK: tl.constexpr):
-    """Adds the squares of `gradient` times `share` to norm[0], which is not finite if one of them is not.
+def square_norm(gradient, size, rank_weight, flag, status, norm, BLOCK: tl.constexpr):
+    """Adds the squares of `gradient` times `rank_weight` to norm[0], which is not finite if one of them is not.
+
+    `gradient` is the sum over the ranks, and `rank_weight` is 1 / (number of ranks).
 
     Test: tests/kernels/test_ranks.py.
     """
     if tl.program_id(0) == 0 and tl.load(flag) > 0:
         tl.atomic_or(status, REPEAT)
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    value = tl.load(gradient + at, mask=at < size, other=0.0) * share
+    value = tl.load(gradient + at, mask=at < size, other=0.0) * rank_weight
     tl.atomic_add(norm, tl.sum(value * value, 0))
 
 
 @triton.jit
 def adam(
-    value, weight, gradient, share, first_moment, second_moment, rates, update, step, status, norm, size,
+    value, weight, gradient, rank_weight, first_moment, second_moment, rates, update, step, status, norm, size,
     others,
     PRECISION: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -305,7 +307,7 @@ def adam(
     mask = at < size
     if others is not None:
         mask &= tl.load(others + at, mask=mask, other=1) == 0
-    g = tl.load(gradient + at, mask=mask, other=0.0) * share
+    g = tl.load(gradient + at, mask=mask, other=0.0) * rank_weight
     m = tl.load(first_moment + at, mask=mask, other=0.0)
     v = tl.load(second_moment + at, mask=mask, other=0.0)
     m += (g - m) * (1 - BETA_1)
@@ -322,8 +324,8 @@ def adam(
 
 
 @triton.jit
-def average_values(value, average, shares, update, status, size, BLOCK: tl.constexpr):
-    """Updates the moving average of the values. shares [updates] are the weights of the new values.
+def average_values(value, average, ema_weights, update, status, size, BLOCK: tl.constexpr):
+    """Updates the moving average of the values. ema_weights [updates] are those of the new values.
 
     An update that is repeated does nothing here. After a skipped update the new values equal the old ones.
 
@@ -334,7 +336,7 @@ def average_values(value, average, shares, update, status, size, BLOCK: tl.const
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = at < size
     mean = tl.load(average + at, mask=mask, other=0.0)
-    mean += (tl.load(value + at, mask=mask, other=0.0) - mean) * tl.load(shares + tl.load(update))
+    mean += (tl.load(value + at, mask=mask, other=0.0) - mean) * tl.load(ema_weights + tl.load(update))
     tl.store(average + at, mean, mask=mask)
 
 

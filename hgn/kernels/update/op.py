@@ -147,23 +147,23 @@ class Updates:
         self.particles = 0
         self.growths = 0  # number of times that the buffers grew
         self.captures, self.capture_seconds = 0, 0.0
-        self._reach = (torch.zeros(3), torch.zeros(3))  # corners of the box that the window must contain
+        self._box = (torch.zeros(3), torch.zeros(3))  # corners of the box that the window must contain
         self._graphs: list[torch.cuda.CUDAGraph] = []
-        self._samples = self._vectors = self._rates = self._shares = torch.empty(0)
+        self._samples = self._vectors = self._rates = self._ema_weights = torch.empty(0)
 
     # updates
 
     def run(
-        self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float], shares: Sequence[float] | None = None
+        self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float], ema_weights: Sequence[float] | None = None
     ) -> None:
         """Makes one update for each entry of `chunk`. An entry lists one sample per scene.
 
-        `shares` are the EMA weights of the new values in `average`. Raises ConfigError when positions are not finite.
+        `ema_weights` are those of the new values in `average`. Raises: ConfigError for positions that are not finite.
         """
-        assert (shares is None) == (self.average is None)
+        assert (ema_weights is None) == (self.average is None)
         self._prepare(chunk, rates)
-        if shares is not None:
-            self._shares[: len(chunk)].copy_(torch.tensor(shares, dtype=torch.float64))
+        if ema_weights is not None:
+            self._ema_weights[: len(chunk)].copy_(torch.tensor(ema_weights, dtype=torch.float64))
         done = 0
         while True:
             for _ in range(len(chunk) - done):
@@ -171,7 +171,7 @@ class Updates:
             done, status, *needed = torch.cat([self.update, self.grid.status, self.grid.needed_L]).tolist()
             if done == len(chunk):
                 return
-            self._make_room(status, needed)
+            self._grow(status, needed)
 
     def predict(self, samples: Sequence[AnySample]) -> None:
         """Assembles the batch of one update and writes the network's output to `fused.output`."""
@@ -183,13 +183,13 @@ class Updates:
             status, *needed = torch.cat([self.grid.status, self.grid.needed_L]).tolist()
             if status == 0:
                 return
-            self._make_room(status, needed)
+            self._grow(status, needed)
 
     def _prepare(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> None:
         """Uploads the tables of a chunk, and grows buffers if necessary."""
         assert len(chunk) == len(rates)
         particles = self._upload(chunk, rates)
-        if particles > self.particles or not self._inside(self._reach):
+        if particles > self.particles or not self._inside(self._box):
             self.particles = max(self.particles, 16 * math.ceil(particles / 16))
             self._build()
 
@@ -208,16 +208,16 @@ class Updates:
         table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
         weight = np.array([sample.weight for sample in flat], np.float64)
         table[..., 5] = weight.view(np.int64).reshape(count.shape)
-        shown = [Symmetry()] * len(flat)
+        symmetries = [Symmetry()] * len(flat)
         if self.symmetry:
-            shown = [drawn_symmetry(sample.episode.symmetries, sample.seed) for sample in flat]
-            table[..., -1] = np.array([symmetry.code for symmetry in shown]).reshape(count.shape)
+            symmetries = [drawn_symmetry(sample.episode.symmetries, sample.seed) for sample in flat]
+            table[..., -1] = np.array([symmetry.code for symmetry in symmetries]).reshape(count.shape)
         vectors = np.zeros((len(flat), 3, 3), np.float32)
         vectors[:, 0] = [sample.episode.domain_size for sample in flat]
         if self.config.relative:
-            vectors[:, 1] = [s.direction(sample.episode.gravity) for s, sample in zip(shown, flat, strict=True)]
-        frictions = [sample.episode.wall_friction for sample in flat]
-        vectors[:, 2] = [[friction[axis] for axis in s.source] for s, friction in zip(shown, frictions, strict=True)]
+            vectors[:, 1] = [s.direction(sample.episode.gravity) for s, sample in zip(symmetries, flat, strict=True)]
+        pairs = [(s.source, sample.episode.wall_friction) for s, sample in zip(symmetries, flat, strict=True)]
+        vectors[:, 2] = [[friction[axis] for axis in source] for source, friction in pairs]
         most = int(count.sum(1).max())
         if len(chunk) > len(self._rates):
             self._allocate_tables(max(len(chunk), TABLE_UPDATES))
@@ -227,10 +227,10 @@ class Updates:
         moving = [(s.episode.moving, s.episode.first_frame + s.frame) for s in flat]
         self.allocate_moving(max(len(own.obstacles) for own, _ in moving))
         if self.moving is not None:
-            self.moving.write(moving, shown)
+            self.moving.write(moving, symmetries)
         self.update.zero_()
         largest = torch.from_numpy(vectors[:, 0]).amax(0)
-        self._reach = (self._reach[0], torch.maximum(self._reach[1], largest))
+        self._box = (self._box[0], torch.maximum(self._box[1], largest))
         return most
 
     def allocate_moving(self, layers: int) -> None:
@@ -246,7 +246,7 @@ class Updates:
         shape = (length, self.scenes)
         self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
         self._vectors = torch.zeros(*shape, 3, 3, device=self.device)
-        self._rates, self._shares = (torch.zeros(length, device=self.device) for _ in range(2))
+        self._rates, self._ema_weights = (torch.zeros(length, device=self.device) for _ in range(2))
 
     def _replay(self) -> None:
         if self.device.type == "cuda" and not self._graphs:
@@ -286,23 +286,24 @@ class Updates:
             kernel.sum_errors[blocks](**errors, **sums, OUT=columns, BLOCK=ERROR_BLOCK)
             kernel.sum_errors_above[cells](**above, sums=self.sum_C4, counts=grid.counts_L, BLOCK=BLOCK)
         kernel.loss_gradient[blocks](
-            **errors, **sums, **above, share_of=self.share_N, gradient=fused.output_gradient, loss=self.loss,
-            scale=1.0 / fused.unscale, cell_mean_weight=self.training.cell_mean_weight, OUT=columns, BLOCK=ERROR_BLOCK,
+            **errors, **sums, **above, loss_weight_of=self.loss_weight_N, gradient=fused.output_gradient,
+            loss=self.loss, scale=1.0 / fused.unscale, cell_mean_weight=self.training.cell_mean_weight, OUT=columns,
+            BLOCK=ERROR_BLOCK,
         )  # fmt: skip
         fused.backward()
         if self.reduce is not None:
-            kernel.tell_overflow[(1,)](status=self.grid.status, flag=fused.totals[-TAIL:])
+            kernel.flag_overflow[(1,)](status=self.grid.status, flag=fused.totals[-TAIL:])
 
     def launches_after_reduction(self) -> None:
         """Makes the launches from the summed gradients to the new parameters."""
-        fused, size, share = self.fused, self.packed.size, 1.0 / self.ranks
+        fused, size, rank_weight = self.fused, self.packed.size, 1.0 / self.ranks
         blocks = (triton.cdiv(size, FLAT_BLOCK),)
         kernel.square_norm[blocks](
-            gradient=fused.totals, size=size, share=share, flag=fused.totals[-TAIL:], status=self.grid.status,
-            norm=self.norm, BLOCK=FLAT_BLOCK,
+            gradient=fused.totals, size=size, rank_weight=rank_weight, flag=fused.totals[-TAIL:],
+            status=self.grid.status, norm=self.norm, BLOCK=FLAT_BLOCK,
         )  # fmt: skip
         kernel.adam[blocks](
-            value=self.values, weight=fused.weights, gradient=fused.totals, share=share,
+            value=self.values, weight=fused.weights, gradient=fused.totals, rank_weight=rank_weight,
             first_moment=self.first_moment, second_moment=self.second_moment, rates=self._rates,
             update=self.update, step=self.step, status=self.grid.status, norm=self.norm, size=size,
             others=self.blocks.member if self.blocks else None, PRECISION=fused.copy_precision,
@@ -310,12 +311,12 @@ class Updates:
         )  # fmt: skip
         if self.blocks is not None:
             self.blocks.step(
-                self.values, fused.weights, self.first_moment, fused.totals, share, self._rates, self.update,
+                self.values, fused.weights, self.first_moment, fused.totals, rank_weight, self._rates, self.update,
                 self.grid.status, self.norm, fused.copy_precision,
             )  # fmt: skip
         if self.average is not None:
             kernel.average_values[blocks](
-                value=self.values, average=self.average, shares=self._shares, update=self.update,
+                value=self.values, average=self.average, ema_weights=self._ema_weights, update=self.update,
                 status=self.grid.status, size=size, BLOCK=FLAT_BLOCK,
             )  # fmt: skip
         fused.refresh_encoder()
@@ -341,12 +342,12 @@ class Updates:
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
             samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.buffers.position_N3,
             velocity=self.buffers.velocity_NV, scene_of=self.buffers.scene_N, material_of=self.buffers.material_N,
-            target=self.target_N3, share_of=self.share_N, origin=self.buffers.origin_S3, domain=self.buffers.domain_S3,
-            gravity=self.buffers.gravity_S3, obstacle_table=self._obstacle_row, particle_count=self.buffers.count,
-            mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
+            target=self.target_N3, loss_weight_of=self.loss_weight_N, origin=self.buffers.origin_S3,
+            domain=self.buffers.domain_S3, gravity=self.buffers.gravity_S3, obstacle_table=self._obstacle_row,
+            particle_count=self.buffers.count, mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
             jitter=config.cell_size if self.jitter else 0.0, scenes=self.scenes,
             wall_friction=self.buffers.domain_S3 if walls is None else walls,
-            parameter_of=self.share_N if parameter_NP is None else parameter_NP,
+            parameter_of=self.loss_weight_N if parameter_NP is None else parameter_NP,
             rest_of=self.buffers.scene_N if rest_NR is None else rest_NR,
             obstacle_cell_size=self.obstacle_cell_size, HISTORY=config.velocity_history,
             SYMMETRY=self.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
@@ -360,10 +361,8 @@ class Updates:
         self.grid.build(self.buffers)
         self.grid.prepare(self.buffers, self.scale, self.obstacles, self.symmetry, self.moving)
 
-    # window and buffers
-
-    def _inside(self, reach: tuple[torch.Tensor, torch.Tensor]) -> bool:
-        return bool((self._built_reach[0] <= reach[0]).all() and (self._built_reach[1] >= reach[1]).all())
+    def _inside(self, box: tuple[torch.Tensor, torch.Tensor]) -> bool:
+        return bool((self._built_box[0] <= box[0]).all() and (self._built_box[1] >= box[1]).all())
 
     def _build(self) -> None:
         """Allocates buffers for `particles` and `capacities`. It first measures capacities that are unknown."""
@@ -371,12 +370,12 @@ class Updates:
         self._graphs = []
         if hasattr(self, "fused"):
             del self.fused, self.grid  # frees the old buffers before the allocation of the new ones
-        self._built_reach = self._reach
+        self._built_box = self._box
         self.buffers = DeviceParticles.empty(
             particles, self.scenes, config.velocity_history, device, config.own_physics
         )
         self.target_N3 = torch.zeros(particles, 3, device=device)
-        self.share_N = torch.zeros(particles, device=device)
+        self.loss_weight_N = torch.zeros(particles, device=device)
         # Bodies divide only cells for which the finest level has room, so the second measurement finds theirs.
         for _ in range(0 if self.capacities else 1 + config.body_cells):
             self.grid = self._device_grid(self.capacities or (16,) * config.levels)
@@ -393,18 +392,18 @@ class Updates:
         )
 
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
-        config, (lower, upper) = self.config, self._reach
+        config, (lower, upper) = self.config, self._box
         window = Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
         sums = 4 * sum(capacities) * (self.training.cell_mean_weight > 0)
         return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device, more=(sums,))
 
-    def _make_room(self, status: int, needed: list[int]) -> None:
+    def _grow(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
             position = self.buffers.position_N3[: int(self.buffers.count)]
             if not bool(position.isfinite().all()):
                 raise ConfigError("positions of the training episodes must be finite, got some that are not")
             low, high = position.amin(0).cpu(), position.amax(0).cpu()
-            self._reach = (torch.minimum(self._reach[0], low), torch.maximum(self._reach[1], high))
+            self._box = (torch.minimum(self._box[0], low), torch.maximum(self._box[1], high))
         grown = self._rounded(needed)
         self.capacities = tuple(
             c if n <= c else max(c, g) for c, n, g in zip(self.capacities, needed, grown, strict=True)
