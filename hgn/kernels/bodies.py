@@ -13,11 +13,11 @@ THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # limits of a cell
 
 
 @triton.jit
-def coarsest_cells(coarsest_of, share_of, row, live):
+def coarsest_cells(coarsest_of, cell_weight_of, row, live):
     """Returns the particles' coarsest cells [N, 8], each once and -1 elsewhere, and their weights [N, 8]."""
     at = row[:, None] * 8 + tl.arange(0, 8)[None, :]
     cell = tl.load(coarsest_of + at, mask=live[:, None], other=-1)
-    return cell, tl.load(share_of + at, mask=cell >= 0, other=0.0)
+    return cell, tl.load(cell_weight_of + at, mask=cell >= 0, other=0.0)
 
 
 @triton.jit

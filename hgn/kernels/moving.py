@@ -1,7 +1,7 @@
 """Holds obstacles in motion on the device: cells and barriers in coordinates that move with them, and poses.
 
-hgn.kernels.poses defines the records. A turn is a frame of a simulation or an update of a training.
-Shape legend: T turns, S scenes, J most moving obstacles of a scene, V = J S rows.
+hgn.kernels.poses defines the records. An instant is a frame of a simulation or an update of a training.
+Shape legend: T instants, S scenes, J most moving obstacles of a scene, V = J S rows.
 """
 
 from collections.abc import Sequence
@@ -42,14 +42,14 @@ NONE_MOVES = EpisodeMoving()
 
 
 class MovingTable:
-    """Holds the records of the moving obstacles of several turns."""
+    """Holds the records of the moving obstacles of several instants."""
 
-    def __init__(self, turn: torch.Tensor, turns: int, scenes: int, layers: int, cell_size: float) -> None:
-        """Takes the number of the turn, int32 [1]. `layers`, the largest J, is rounded up to a power of two."""
-        self.turn, self.scenes, self.cell_size = turn, scenes, cell_size
+    def __init__(self, instant: torch.Tensor, instants: int, scenes: int, layers: int, cell_size: float) -> None:
+        """Takes the number of the instant, int32 [1]. `layers`, the largest J, is rounded up to a power of two."""
+        self.instant, self.scenes, self.cell_size = instant, scenes, cell_size
         self.layers = triton.next_power_of_2(layers)
-        shape = turns, scenes * self.layers, ROW_COLUMNS
-        self.record_TVR = torch.zeros(shape, dtype=torch.int64, device=turn.device)
+        shape = instants, scenes * self.layers, ROW_COLUMNS
+        self.record_TVR = torch.zeros(shape, dtype=torch.int64, device=instant.device)
         self._alive: list[Any] = []  # cells and barriers, and their tables, whose addresses the records contain
 
     def fits(self, moving: MovingObstacles) -> bool:
@@ -58,7 +58,7 @@ class MovingTable:
         return same and moving.layers <= self.layers
 
     def take(self, moving: MovingObstacles | None, friction: bool) -> None:
-        """Writes the cells and barriers of obstacles to all turns, with `friction` that of cells too."""
+        """Writes the cells and barriers of obstacles to all instants, with `friction` that of cells too."""
         cells, barriers = (None, None) if moving is None else (moving.cells, moving.barriers)
         if self._alive and self._alive[0] is cells and self._alive[1] is barriers:
             return
@@ -67,20 +67,20 @@ class MovingTable:
         if cells is not None:
             tables[0] = SceneTable.of_obstacles(cells, rows, friction)
         if barriers is not None:
-            tables[OBSTACLE_COLUMNS] = SceneTable.of_barriers(barriers, rows, self.turn.device)
+            tables[OBSTACLE_COLUMNS] = SceneTable.of_barriers(barriers, rows, self.instant.device)
         for first, table in tables.items():
             self.record_TVR[:, :rows, first : first + table.row_SC.shape[1]] = table.row_SC
         self._alive += tables.values()
 
     def write(self, samples: Sequence[tuple[EpisodeMoving, int]], symmetries: Sequence[Symmetry]) -> None:
-        """Writes the images of samples, obstacles in a frame: a turn for the scenes of an update, then for the next."""
-        own, turns = [moving.obstacles for moving, _ in samples], len(samples) // self.scenes
-        row_TVO = np.zeros((turns, self.record_TVR.shape[1], OBSTACLE_COLUMNS), np.int64)
+        """Writes the images of samples, which are obstacles in a frame: an instant for the scenes of each update."""
+        own, instants = [moving.obstacles for moving, _ in samples], len(samples) // self.scenes
+        row_TVO = np.zeros((instants, self.record_TVR.shape[1], OBSTACLE_COLUMNS), np.int64)
         for number, ((moving, _), symmetry) in enumerate(zip(samples, symmetries, strict=True)):
-            turn, scene = divmod(number, self.scenes)
-            for row_O, cells in zip(row_TVO[turn, scene :: self.scenes], moving.hashes, strict=False):
+            instant, scene = divmod(number, self.scenes)
+            for row_O, cells in zip(row_TVO[instant, scene :: self.scenes], moving.hashes, strict=False):
                 row_O[:] = 0 if cells is None else [*cells.row()[:-1], symmetry.code]
-        self.record_TVR[:turns, :, :OBSTACLE_COLUMNS].copy_(torch.from_numpy(row_TVO))
+        self.record_TVR[:instants, :, :OBSTACLE_COLUMNS].copy_(torch.from_numpy(row_TVO))
         if any(own):
             frame_s = max(moving.frame_s for moving, _ in samples)
             self.set_poses(0, own, [frame for _, frame in samples], frame_s, symmetries)
@@ -93,14 +93,14 @@ class MovingTable:
         frame_s: float,
         symmetries: Sequence[Symmetry] = (),
     ) -> None:
-        """Writes the poses, or their images, of turn `first` and later ones. A turn has `self.scenes` scenes."""
+        """Writes the poses, or their images, of instant `first` and later ones. An instant has `self.scenes` scenes."""
         poses, layers = poses_of(scenes, frames, frame_s), max(map(len, scenes))
         poses = poses.under([*symmetries] * layers) if symmetries else poses
         parts = [poses.rotation_V33.flatten(1), poses.place_V3, poses.pivot_V3, poses.change_V33.flatten(1)]
         parts += [poses.shift_V3, poses.later.rotation_V33.flatten(1), poses.later.place_V3, 0 * poses.shift_V3[:, :1]]
         pose_JTSP = torch.cat(parts, 1).float().unflatten(0, (layers, -1, self.scenes))
         pose_TVP = pose_JTSP.transpose(0, 1).flatten(1, 2)
-        if self.turn.device.type == "cuda":
+        if self.instant.device.type == "cuda":
             pose_TVP = pose_TVP.pin_memory()
         rows = self.record_TVR.view(torch.float32)[first : first + len(pose_TVP), : pose_TVP.shape[1], 2 * FIRST_POSE :]
         rows.copy_(pose_TVP, non_blocking=True)
@@ -108,5 +108,5 @@ class MovingTable:
 
 def arguments_of(table: MovingTable | None, nothing: torch.Tensor) -> dict[str, Any]:
     """Returns arguments of kernels. Without a table they are `nothing`, which kernels do not read."""
-    record, turn, scenes = (nothing, nothing, 0) if table is None else (table.record_TVR, table.turn, table.scenes)
-    return {"moving": record, "poses": record.view(torch.float32), "turn": turn, "scenes": scenes}
+    record, at, scenes = (nothing, nothing, 0) if table is None else (table.record_TVR, table.instant, table.scenes)
+    return {"moving": record, "poses": record.view(torch.float32), "instant": at, "scenes": scenes}

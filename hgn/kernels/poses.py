@@ -1,8 +1,8 @@
 """Moves places and directions to the frames of moving obstacles and back, on the device.
 
-The table of hgn.kernels.moving has a record of RECORD int64 numbers for each turn and each row (hgn.network.moving):
+The table of hgn.kernels.moving has a record of RECORD int64 numbers for each instant and each row (hgn.network.moving):
 the row of the obstacle table, that of the barrier table, and POSE float32 numbers R, p, c, A, b, R' and p'. The kernels
-read the number of the turn on the device, because CUDA graphs repeat their arguments.
+read the number of the instant on the device, because CUDA graphs repeat their arguments.
 """
 
 import triton

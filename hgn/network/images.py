@@ -1,9 +1,10 @@
-"""Mirror images of scenes, in which simulations predict their frames.
+"""Images of scenes, turned by 180 degrees about y, in which simulations predict every second frame.
 
 A network's sideways errors repeat in each frame and add up. So frame k is predicted in the image IMAGES[k mod 2] of the
-scene, and the accelerations are mirrored back. A bias of the network then cancels over two frames, in scenes of any
-symmetry. Training shows all images (hgn.scene.symmetry). A mirrored axis exchanges the planes on which the walls of
-`step.wall_clearance` stop particles, as it exchanges the solver's nodes: x becomes domain + near - far - x.
+scene, and the accelerations are turned back. A bias of the network then cancels over two frames, in scenes of any
+symmetry. Training shows all images (hgn.scene.symmetry). The turn mirrors the axes x and z. A mirrored axis exchanges
+the planes on which the walls of `step.wall_clearance` stop particles: x becomes domain + near - far - x. In backend
+triton `show_image` writes the image of particles, and `advance` the sign of the next image.
 Shape legend: N particles, S scenes, V rows of moving obstacles.
 """
 

@@ -1,6 +1,6 @@
 """Frames of a simulation as CUDA graphs (paper algorithm 1), without synchronisation within a block of frames.
 
-The host reads the status after each block of `look_frames` frames, while the device computes the next block. If the
+The host reads the status after each block of `block_frames` frames, while the device computes the next block. If the
 grid needed more memory than it had, the completed frames are kept and the buffers grow. The simulation continues from
 the last good frame, so no frame is computed twice.
 Shape legend: N particles of all scenes, M velocities of a history, S scenes, T frames.
@@ -39,7 +39,7 @@ from hgn.step.reference import rested
 from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.system.machine import available_cpus
 
-LOOK_FRAMES, FEWEST_FRAMES = 32, 4  # largest and smallest number of frames in a block
+BLOCK_FRAMES, FEWEST_FRAMES = 32, 4  # largest and smallest number of frames in a block
 CROWDED = 140  # number of particles above which a finest cell is crowded; 1.5 times the density of bodies in the data
 PATH_BYTES = 1 << 27  # memory of positions on their way to the host; with many particles it shortens blocks
 GROWTH = 2.0  # (new capacity) / (needed cells) when buffers grow
@@ -57,7 +57,7 @@ def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
     for level, count in enumerate(cells):
         spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
         roomy = min(HEADROOM * count, spread, ROOMY_CELLS >> 2 * level)
-        capacities.append(max(256 >> level, _room(count, level, TIGHT_START), int(roomy)))
+        capacities.append(max(256 >> level, _grown(count, level, TIGHT_START), int(roomy)))
     return tuple(capacities)
 
 
@@ -70,7 +70,7 @@ def crowded(position_N3: torch.Tensor, scene_N: torch.Tensor, cell_size: float) 
     return 20 * int(count_C[count_C > CROWDED].sum()) > len(position_N3)
 
 
-def _room(count: int, level: int, tight: float) -> int:
+def _grown(count: int, level: int, tight: float) -> int:
     """Returns GROWTH times the count. Counts above ROOMY_CELLS get less, but at least `tight` times the count."""
     return max(int(tight * count), int(GROWTH * min(count, ROOMY_CELLS >> 2 * level)))
 
@@ -84,7 +84,7 @@ def _own_physics(config: NetworkConfig, state: ParticleState) -> tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _LaunchedBlock:
     """Launched frames: their number, the index of the first one, and `frame` and `status` after the last one."""
 
     frames: int
@@ -139,8 +139,8 @@ class TritonStepper:
             self.barriers = barriers or SceneTable.of_barriers(state.barriers, self.scenes, self.device)
         self.moving: MovingTable | None = None
         affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
-        self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
-        self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
+        self.block_frames = max(FEWEST_FRAMES, min(BLOCK_FRAMES, affordable))
+        self.path_TN3 = torch.zeros(2 * self.block_frames, self.particles, 3, device=self.device)
         self.overlap = self.device.type == "cuda"  # the next block starts before the results of this one are fetched
         normaliser = network.normaliser
         mean_3, std_3 = normaliser.feature_scale(self.config.relative)
@@ -149,9 +149,9 @@ class TritonStepper:
         self.growths = 0
         self.half_sums = Tuning.of(self.precision).half_sums and not self._crowded(state)
         if state.moving is not None:
-            turns = len(self.path_TN3) + 1  # a turn for each row of the path, and one for the frame after it
+            instants = len(self.path_TN3) + 1  # an instant for each row of the path, and one for the frame after it
             layers, size = state.moving.layers, state.moving.cell_size
-            self.moving = MovingTable(self.frame, turns, self.scenes, layers=layers, cell_size=size)
+            self.moving = MovingTable(self.frame, instants, self.scenes, layers=layers, cell_size=size)
         self._fill(state)
         self._build(capacities or self._first_capacities())
 
@@ -242,7 +242,7 @@ class TritonStepper:
         self._moving, self._passed = state.moving, 0  # _passed: number of frames since `_moving`
         if self.moving is not None:
             self.moving.take(state.moving, "friction" in self.own_physics)
-            self.frame.zero_()  # the turn of the present frame
+            self.frame.zero_()  # the instant of the present frame
             self._set_poses(0, 1)
 
     def fits_moving(self, moving: MovingObstacles | None) -> bool:
@@ -250,7 +250,7 @@ class TritonStepper:
         return moving is None or (self.moving is not None and self.moving.fits(moving))
 
     def _set_poses(self, first: int, frames: int, ahead: int = 0) -> None:
-        """Writes the poses of the next frames, or of those after `ahead` frames, to turns from `first` on."""
+        """Writes the poses of the next frames, or of those after `ahead` frames, to instants from `first` on."""
         if self.moving is not None and self._moving is not None:
             own, begin = self._moving, self._passed + ahead
             at = [frame + begin + i for i in range(frames) for frame in own.frames]
@@ -280,7 +280,7 @@ class TritonStepper:
         position_N3 = self.buffers.position_N3[: self.live]
         if (image := self.buffers.image) is not None:
             scene_N = self.buffers.scene_N[: self.live].long()
-            position_N3 = torch.cat([position_N3, self.buffers.domain_S3[scene_N] + image.fold - position_N3])
+            position_N3 = torch.cat([position_N3, self.buffers.domain_S3[scene_N] + image.wall_shift - position_N3])
         box = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
         size = self.buffers.domain_S3.amax(0).cpu()
         lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
@@ -375,24 +375,24 @@ class TritonStepper:
         )  # fmt: skip
 
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
-        """Yields blocks of up to `look_frames` frames. While a block is processed, the device computes the next one.
+        """Yields blocks of up to `block_frames` frames. While a block is processed, the device computes the next one.
 
         Raises: torch.OutOfMemoryError if buffers cannot grow. A later call continues from the last completed frame.
         """
         done, half = 0, 0
-        ahead: _Look | None = None
+        ahead: _LaunchedBlock | None = None
         while done < frames:
-            look = ahead or self._launch(min(self.look_frames, frames - done), half)
-            remaining, half = frames - done - look.frames, 1 - half
+            block = ahead or self._launch(min(self.block_frames, frames - done), half)
+            remaining, half = frames - done - block.frames, 1 - half
             # If this block ends with a non-zero status, these launches change nothing.
             ahead = None
             if self.overlap and remaining:
-                ahead = self._launch(min(self.look_frames, remaining), half, look.frames)
-            path_TN3, status = self._settle(look)
+                ahead = self._launch(min(self.block_frames, remaining), half, block.frames)
+            path_TN3, status = self._finish(block)
             done += len(path_TN3)
             self._passed += len(path_TN3)
             if status and ahead is not None:
-                self._settle(ahead)  # its launches use the buffers that may grow now
+                self._finish(ahead)  # its launches use the buffers that may grow now
                 ahead = None
             lost = bool(status & DIVERGED)
             yield path_TN3, lost
@@ -401,9 +401,9 @@ class TritonStepper:
             if status & (OVERFLOW | OUT_OF_WINDOW):
                 self._grow()
 
-    def _launch(self, frames: int, half: int, ahead: int = 0) -> _Look:
+    def _launch(self, frames: int, half: int, ahead: int = 0) -> _LaunchedBlock:
         """Starts some frames, after `ahead` frames in progress. Their positions are written to one half of the path."""
-        first = half * self.look_frames
+        first = half * self.block_frames
         self._set_poses(first, frames, ahead)
         self.frame.fill_(first)
         for _ in range(frames):
@@ -413,26 +413,26 @@ class TritonStepper:
                 self.graph.replay()
         seen = torch.cat([self.frame, self.grid.status])
         if self.device.type != "cuda":
-            return _Look(frames, first, seen, None)
+            return _LaunchedBlock(frames, first, seen, None)
         seen = torch.empty(2, dtype=seen.dtype, pin_memory=True).copy_(seen, non_blocking=True)
         end = torch.cuda.Event()
         end.record()
-        return _Look(frames, first, seen, end)
+        return _LaunchedBlock(frames, first, seen, end)
 
-    def _settle(self, look: _Look) -> tuple[torch.Tensor, int]:
+    def _finish(self, block: _LaunchedBlock) -> tuple[torch.Tensor, int]:
         """Waits for started frames. Returns the positions of the completed frames and the status after them."""
-        if look.end is not None:
-            look.end.synchronize()
-        last, status = look.seen.tolist()
-        taken = last - look.first
-        start = 3 * look.first * self.live
+        if block.end is not None:
+            block.end.synchronize()
+        last, status = block.seen.tolist()
+        taken = last - block.first
+        start = 3 * block.first * self.live
         return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
 
     def _grow(self) -> None:
         # all levels grow, because levels that did not overflow are nearly full and would soon require another capture
         before, needed = self.grid.capacities, self.grid.needed_L.tolist()
         pairs = zip(before, needed, strict=True)
-        capacities = tuple(max(c, _room(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))
+        capacities = tuple(max(c, _grown(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))
         self.growths += 1
         # Free the old buffers first, so that memory need not contain both; particles are stored elsewhere.
         self.graph = None

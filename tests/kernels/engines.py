@@ -85,9 +85,9 @@ def prepare(engine, network, state, origin_S3):
 
 
 def table_of(moving, friction):
-    """The records of a frame, the second of three turns."""
-    turn = torch.ones(1, dtype=torch.int32, device=device())
-    table = MovingTable(turn, 3, len(moving.scenes), moving.layers, moving.cell_size)
+    """The records of a frame, the second of three instants."""
+    instant = torch.ones(1, dtype=torch.int32, device=device())
+    table = MovingTable(instant, 3, len(moving.scenes), moving.layers, moving.cell_size)
     table.take(moving.to(device()), friction)
     table.set_poses(1, moving.scenes, moving.frames, moving.frame_s)
     return table

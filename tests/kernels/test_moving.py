@@ -37,7 +37,7 @@ REQUIRE_PARITY = TritonStepper.require_parity  # which other tests leave out
 def test_moving_obstacles(clearance, monkeypatch):
     """Frames of scenes with two, one and no moving obstacles are those of backend torch, over several blocks. The same
     buffers go on with fewer obstacles in another frame, and with none, to the rounding of a GPU's sums."""
-    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
+    monkeypatch.setattr(triton_stepper, "BLOCK_FRAMES", 2)
     monkeypatch.setattr(triton_stepper, "FEWEST_FRAMES", 2)
     changes = {"inputs": "local", "own_physics": ("friction", "moving"), "wall_clearance": (0.01, 0.01)}
     changes |= {"obstacle_clearance": clearance, "levels": 2, "deviation": 0.01}
@@ -103,7 +103,7 @@ def test_moving_barriers(overlap, monkeypatch):
     are PyTorch's in float64, over several blocks, and no particle passes an obstacle. With `overlap` blocks start
     before earlier ones are read, and buffers grow. PyTorch's own float32 differs by 8e-8; a pose of another frame by
     1e-3."""
-    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
+    monkeypatch.setattr(triton_stepper, "BLOCK_FRAMES", 2)
     monkeypatch.setattr(triton_stepper, "FEWEST_FRAMES", 2)
     scenes, simulator = pushed_scenes(), thrown("triton", **PUSHED)
     state = simulator.start(scenes)

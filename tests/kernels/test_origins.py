@@ -162,7 +162,7 @@ def test_scenes_that_change_continue_with_their_frames(backend):
 
 def test_growing_buffers_repeat_no_origin(monkeypatch):
     """If the grid needs more memory within a block, the frame that lacked it is computed with its own origin."""
-    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 8)
+    monkeypatch.setattr(triton_stepper, "BLOCK_FRAMES", 8)
     simulator = simulator_of("triton")
     state = simulator.start([scene(5), scene(4, 1)])
     expected_TN3 = expected_path(simulator.network, state, 4)

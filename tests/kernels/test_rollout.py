@@ -239,7 +239,7 @@ def test_later_simulations_begin_anew(monkeypatch):
     """A simulator uses its captured graphs again, also for fewer particles, other obstacles and other gravity. The
     frames are bitwise those of a new simulator, also after a divergence, before which the good frames are returned.
     This holds for single frames during another simulation too; the buffers of the one that ends last are kept."""
-    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
+    monkeypatch.setattr(triton_stepper, "BLOCK_FRAMES", 2)
     first, second = scene(3), scene(2, 1, gravity=(0.0, 2.0, 0.0))
     again, other = (Simulator(network(inputs="relative"), 60.0, "triton", "fp32") for _ in range(2))
     (expected,) = again.rollout([first], 3)
@@ -359,7 +359,7 @@ def test_growing_gives_back_first(monkeypatch):
 def test_frames_taken_away_beside_the_next(monkeypatch):
     """Frames that start before earlier ones are read are bitwise the same, also while buffers grow, and equal those of
     a simulation with enough capacity. Frames started in vain change nothing. The frame of a divergence is the same."""
-    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 1)
+    monkeypatch.setattr(triton_stepper, "BLOCK_FRAMES", 1)
     expected_TN3 = roomy_path()
     paths, growths, lost = [], [], []
     for overlap in (False, True):

@@ -27,7 +27,7 @@ def _coarsest_places(place_of, row, live):
 
 @triton.jit
 def sum_coarsest(
-    x, coarsest_of, share_of, place_of, neighbour, counts, disturbed, felt, sums, particle_count, capacity,
+    x, coarsest_of, cell_weight_of, place_of, neighbour, counts, disturbed, felt, sums, particle_count, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -42,7 +42,7 @@ def sum_coarsest(
     if FEEL:
         most_around(disturbed, felt, 0, neighbour, row, row < tl.load(counts + LEVELS - 1), capacity)
     live = row < tl.load(particle_count)
-    cell, share = coarsest_cells(coarsest_of, share_of, row, live)
+    cell, cell_weight = coarsest_cells(coarsest_of, cell_weight_of, row, live)
     px, py, pz = _coarsest_places(place_of, row, live)
     if OVERLAP:
         gdc_wait()
@@ -50,12 +50,12 @@ def sum_coarsest(
     column = tl.arange(0, OUT)[None, :]
     value = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < USED), other=0.0)
     part = column[:, None, :]
-    added = share[:, :, None] * value[:, None, :]
+    added = cell_weight[:, :, None] * value[:, None, :]
     vx, vy, vz = three_columns(x, row, 0, live, 1.0, OUT)
     vx, vy, vz = vx[:, None], vy[:, None], vz[:, None]
-    added = tl.where(part == USED, (share * (py * vz - pz * vy))[:, :, None], added)
-    added = tl.where(part == USED + 1, (share * (pz * vx - px * vz))[:, :, None], added)
-    added = tl.where(part == USED + 2, (share * (px * vy - py * vx))[:, :, None], added)
+    added = tl.where(part == USED, (cell_weight * (py * vz - pz * vy))[:, :, None], added)
+    added = tl.where(part == USED + 1, (cell_weight * (pz * vx - px * vz))[:, :, None], added)
+    added = tl.where(part == USED + 2, (cell_weight * (px * vy - py * vx))[:, :, None], added)
     # The added columns are a multiple of four, because the hardware adds four at once.
     adds = (cell >= 0)[:, :, None] & (part < (USED + 6) // 4 * 4)
     tl.atomic_add(sums + cell[:, :, None] * OUT + part, added, mask=adds, sem="relaxed")
@@ -256,19 +256,19 @@ def _mass(motion, geometry, cell, there, LEVELS: tl.constexpr):
 
 @triton.jit
 def add_coarsest(
-    x, table, coarsest_of, share_of, place_of, particle_count,
+    x, table, coarsest_of, cell_weight_of, place_of, particle_count,
     OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Applies the coarsest cells' table [C, OUT] to the particles' rows of x [N, OUT].
 
-    Multiplies columns 0 to 2 by the table's column USED. Adds the table's columns before USED, weighted by `share_of`,
+    Multiplies columns 0 to 2 by the table's column USED. Adds its columns before USED, with weights `cell_weight_of`,
     and the rotation about the cells' middles in the three columns after it. COLUMNS: a power of two above USED.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
-    cell, share = coarsest_cells(coarsest_of, share_of, row, live)
+    cell, cell_weight = coarsest_cells(coarsest_of, cell_weight_of, row, live)
     place = _coarsest_places(place_of, row, live)
     column = tl.arange(0, COLUMNS)[None, :]
     own = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < 3), other=0.0)
@@ -277,9 +277,9 @@ def add_coarsest(
         gdc_launch_dependents()
     at = table + cell[:, :, None] * OUT + column[:, None, :]
     found = tl.load(at, mask=(cell >= 0)[:, :, None] & (column <= USED)[:, None, :], other=0.0)
-    total = tl.sum(share[:, :, None] * found, 1)
+    total = tl.sum(cell_weight[:, :, None] * found, 1)
     factor = tl.sum(tl.where(column == USED, total, 0.0), 1)
-    swing = cross(three_columns(table, cell, USED + 1, cell >= 0, share, OUT), place)
+    swing = cross(three_columns(table, cell, USED + 1, cell >= 0, cell_weight, OUT), place)
     for i in tl.static_range(3):
         total += tl.where(column == i, tl.sum(swing[i], 1)[:, None], 0.0)
     tl.store(x + row[:, None] * OUT + column, total + factor[:, None] * own, mask=live[:, None] & (column < USED))

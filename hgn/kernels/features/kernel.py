@@ -160,7 +160,7 @@ def deform(position, rest, particle_count, scale, columns, WIDTH: tl.constexpr, 
 
 
 @triton.jit
-def _add_slip(v, gravity, scale, scene, live, cell, share, sums, COLUMNS: tl.constexpr):
+def _add_slip(v, gravity, scale, scene, live, cell, cell_weight, sums, COLUMNS: tl.constexpr):
     """Adds to the sums [C, COLUMNS] the columns of `add_friction` that depend on velocity, for the velocity `v`."""
     column = tl.arange(0, 4)[None, :]
     value = 0.0 * v[0][:, None] + 0.0 * column
@@ -172,13 +172,13 @@ def _add_slip(v, gravity, scale, scene, live, cell, share, sums, COLUMNS: tl.con
     value = with_column(value, 3, square)
     at = sums + cell[:, :, None] * COLUMNS + 12 + column[:, None, :]
     there = (cell >= 0)[:, :, None] & (column >= 0)[:, None, :]
-    tl.atomic_add(at, share[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
+    tl.atomic_add(at, cell_weight[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
 
 
 @triton.jit
 def prepare_relative_features(
-    velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
-    parent, geometry, features, touch_of, disturbed, felt, parameter_of, surface_of, drift, friction, quiet,
+    velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, cell_weight_of,
+    motion, parent, geometry, features, touch_of, disturbed, felt, parameter_of, surface_of, drift, friction, quiet,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, FRICTION: tl.constexpr,
     FRICTION_AT: tl.constexpr, PARAMETERS: tl.constexpr, PARAMETERS_AT: tl.constexpr, MOVING: tl.constexpr,
     COLUMNS: tl.constexpr, FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
@@ -235,11 +235,11 @@ def prepare_relative_features(
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)
     touch = tl.load(touch_of + row, mask=live, other=0.0)
     coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
-    share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
-    share_felt = share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0)
-    gate = tl.sum(share_felt, 1)
+    cell_weight = tl.load(cell_weight_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
+    gate_part = cell_weight * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0)
+    gate = tl.sum(gate_part, 1)
     if MOVING > 0:
-        around = three_columns(drift, coarsest, 4, coarsest >= 0, one_over(gate)[:, None] * share_felt, 8)
+        around = three_columns(drift, coarsest, 4, coarsest >= 0, one_over(gate)[:, None] * gate_part, 8)
         surface = three_columns(surface_of, row, 0, live, touch, 3)
         slip = three_columns(velocity, row, 0, live, 1.0, 3 * HISTORY)
         relative = ()
@@ -248,7 +248,7 @@ def prepare_relative_features(
             relative = relative + (own,)  # noqa: RUF005 - Triton does not support unpacking here
             v = with_column(v, CONTACT + i, own)
         if FRICTION > 0:
-            _add_slip(relative, gravity, scale, scene, live, coarsest, share, friction, COLUMNS)
+            _add_slip(relative, gravity, scale, scene, live, coarsest, cell_weight, friction, COLUMNS)
     value = tl.where(is_contact, v, value)
     value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
     value = tl.where(is_contact, value * gate[:, None], value)

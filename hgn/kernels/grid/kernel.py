@@ -19,7 +19,7 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def show_image(
-    position, velocity, scene_of, domain, sign, particle_count, image_position, image_velocity, fold,
+    position, velocity, scene_of, domain, sign, particle_count, image_position, image_velocity, wall_shift,
     HISTORY: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the images of positions [N, 3] and velocity histories [N, 3 HISTORY], by the scenes' `sign` [S, 3].
@@ -39,7 +39,7 @@ def show_image(
     tl.store(image_velocity + at, factor * tl.load(velocity + at, mask=live, other=0.0), mask=live)
     is_place = live & (column < 3)
     at = row[:, None] * 3 + column
-    shift = tl.where(factor < 0, tl.load(domain + entry, mask=is_place, other=0.0) + fold, 0.0)
+    shift = tl.where(factor < 0, tl.load(domain + entry, mask=is_place, other=0.0) + wall_shift, 0.0)
     x = tl.load(position + at, mask=is_place, other=0.0)
     tl.store(image_position + at, factor * x + shift, mask=is_place)
 
@@ -194,18 +194,18 @@ def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
     ABOVE: tl.constexpr = LEVELS - 1
     EDGE: tl.constexpr = 1 << ABOVE
     split = ((x + (fraction > 0).to(tl.int32)) >> ABOVE) != x >> ABOVE
-    share = tl.where(split[:, None], tl.where(high, fraction[:, None], 1 - fraction[:, None]), 1.0)
+    cell_weight = tl.where(split[:, None], tl.where(high, fraction[:, None], 1 - fraction[:, None]), 1.0)
     place = ((x & EDGE - 1).to(tl.float32) + fraction - 0.5 * (EDGE - 1)) / EDGE
-    return (high == 0) | split[:, None], share, place
+    return (high == 0) | split[:, None], cell_weight, place
 
 
 @triton.jit
 def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
-    weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
-    obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, turn,
-    surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity, place, way, sign,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
+    weight_of, fraction_of, motion, coarsest_of, cell_weight_of, place_of, moments, domain, obstacle_table,
+    obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, instant,
+    surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity, scene_position, scene_velocity,
+    sign, HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, REACH: tl.constexpr, FEATURES: tl.constexpr,
     FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, BODIES: tl.constexpr,
     OVERLAP: tl.constexpr, IMAGE: tl.constexpr, BLOCK: tl.constexpr,
@@ -213,14 +213,14 @@ def prepare_particles(
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
     With MOTION (relative inputs) it writes for each particle too: the features of surfaces; its contact `touch_of` [N];
-    its coarsest cells `coarsest_of` [N, 8], where repeated cells are -1; its weights in them, `share_of`; and its place
-    [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the finest
-    (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
+    its coarsest cells `coarsest_of` [N, 8], where repeated cells are -1; its weights `cell_weight_of` in them; and
+    its place [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the
+    finest (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
     (`moments` [C, COLUMNS]). It raises column 1 of the coarsest cells' `disturbed` [C, 2] to at least the contact times
     FULLY. With FRICTION, a number of columns, `add_friction` writes these from FRICTION_AT on and adds to `friction`
     [C, COLUMNS]. With MOVING it writes V (`surfaces_of`) to `surface_of` [N, 3], and `add_drift` adds V to `drift`
-    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features, REACH as in obstacle_normals. `place`, `way`,
-    `sign` and IMAGE are those of surfaces_of.
+    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features, REACH as in obstacle_normals.
+    `scene_position`, `scene_velocity`, `sign` and IMAGE are those of surfaces_of.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -235,8 +235,8 @@ def prepare_particles(
     if MOTION:
         surfaces, touch, surface = surfaces_of(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses,
-            turn, scenes, place, way, sign, HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3, REACH, MOVING,
-            IMAGE,
+            instant, scenes, scene_position, scene_velocity, sign, HISTORY, OBSTACLES, SYMMETRY,
+            4 if FRICTION > 0 else 3, REACH, MOVING, IMAGE,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]
@@ -270,7 +270,7 @@ def prepare_particles(
         across_x, share_x, px = _coarsest_part(x, fx, high_x, LEVELS)
         across_y, share_y, py = _coarsest_part(y, fy, high_y, LEVELS)
         across_z, share_z, pz = _coarsest_part(z, fz, high_z, LEVELS)
-        share = share_x * share_y * share_z
+        cell_weight = share_x * share_y * share_z
         above = slots_of(geometry, LEVELS - 1)
         slot = slot_of(cx >> LEVELS - 1, cy >> LEVELS - 1, cz >> LEVELS - 1, scene[:, None], above)
         across = inside[:, None] & across_x & across_y & across_z
@@ -281,9 +281,9 @@ def prepare_particles(
             first = tl.load(prefix_sum + above[0] - 1, mask=above[0] > 0, other=0)
             most = tl.load(geometry + (LEVELS - 1) * GEOMETRY_COLUMNS + 5)
             coarsest = cell_in(occupied, prefix_sum, slot, first, most, across)
-        coarsest = tl.where(share > 0, coarsest, -1)
+        coarsest = tl.where(cell_weight > 0, coarsest, -1)
         tl.store(coarsest_of + row[:, None] * 8 + corner, coarsest, mask=here)
-        tl.store(share_of + row[:, None] * 8 + corner, share, mask=here)
+        tl.store(cell_weight_of + row[:, None] * 8 + corner, cell_weight, mask=here)
         tl.store(place_of + row * 3, px, mask=live)
         tl.store(place_of + row * 3 + 1, py, mask=live)
         tl.store(place_of + row * 3 + 2, pz, mask=live)
@@ -293,21 +293,21 @@ def prepare_particles(
         part = tl.arange(0, COLUMNS)[None, None, :]
         one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
         other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
-        added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
+        added = tl.where(part < 9, cell_weight[:, :, None] * one * other, 0.0)
         product = surface_normals(surfaces, BODIES)
         for i in tl.static_range(6):
-            added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
+            added = tl.where(part == 9 + i, cell_weight[:, :, None] * product[i][:, None, None], added)
         # The added columns are a multiple of four, because the hardware adds four at once.
         adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
         raise_disturbed(disturbed + 1, coarsest, touch)
         if FRICTION > 0:
             add_friction(
-                surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, share, friction,
+                surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, cell_weight, friction,
                 features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, MOVING, BODIES, COLUMNS,
             )  # fmt: skip
         if MOVING > 0:
-            add_drift(touch, surface, coarsest, share, drift)
+            add_drift(touch, surface, coarsest, cell_weight, drift)
             for i in tl.static_range(3):
                 tl.store(surface_of + row * 3 + i, surface[i], mask=live)
     if OVERLAP:

@@ -81,7 +81,7 @@ def feature_columns(config: NetworkConfig) -> int:
 class DeviceImage:
     """Holds the image of the particles that the network sees in this frame (hgn.network.images)."""
 
-    fold: float  # near - far of hgn.network.images
+    wall_shift: float  # difference of the wall clearances, near - far
     sign_S3: torch.Tensor
     gravity_S3: torch.Tensor
     position_N3: torch.Tensor  # those of the image, written at the beginning of a frame
@@ -141,9 +141,9 @@ class DeviceGrid:
     (disturbed and touched by their own particles, in units of FULLY) and felt_C2 (its maximum over a cell and the cells
     across its faces). sum_C and table_C are the sums and the table of `balance`. moment_C contains first and second
     moments of places, and sums of products of normals. A particle has its coarsest cells coarsest_N8 (repeated cells
-    are -1), its weights share_N8 in them, its place place_N3 in the lowest one, and its contact touch_N. With friction
-    as an input, friction_C are the sums of `add_friction`, and friction_fraction_C is k of `removed_along` with
-    derivatives. `friction` is the number of friction columns of the particles that were prepared last, 0 without any.
+    are -1), its weights cell_weight_N8 in them, its place place_N3 in the lowest one, and its contact touch_N. With
+    friction as an input, friction_C are the sums of `add_friction`, and friction_fraction_C is k of `removed_along` and
+    its derivatives. `friction` is the number of friction columns of the particles that were prepared last, or 0.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class DeviceGrid:
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
         self.feature_NF = torch.zeros(particles, features, device=device)
         self.coarsest_N8 = integers(particles * relative, 8)
-        self.share_N8 = torch.zeros(particles * relative, 8, device=device)
+        self.cell_weight_N8 = torch.zeros(particles * relative, 8, device=device)
         self.place_N3 = torch.zeros(particles * relative, 3, device=device)
         self.touch_N = torch.zeros(particles * relative, device=device)
         self.surface_N3 = torch.zeros(particles * (drifting > 0), 3, device=device)
@@ -245,8 +245,8 @@ class DeviceGrid:
             kernel.show_image[(triton.cdiv(self.particles, MARK_BLOCK),)](
                 position=particles.position_N3, velocity=particles.velocity_NV, scene_of=particles.scene_N,
                 domain=particles.domain_S3, sign=image.sign_S3, particle_count=particles.count,
-                image_position=image.position_N3, image_velocity=image.velocity_NV, fold=image.fold, HISTORY=history,
-                COLUMNS=triton.next_power_of_2(3 * history), BLOCK=MARK_BLOCK,
+                image_position=image.position_N3, image_velocity=image.velocity_NV, wall_shift=image.wall_shift,
+                HISTORY=history, COLUMNS=triton.next_power_of_2(3 * history), BLOCK=MARK_BLOCK,
             )  # fmt: skip
         kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
             position=(image or particles).position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
@@ -319,12 +319,12 @@ class DeviceGrid:
                 BLOCK=PARTICLE_BLOCK,
             )  # fmt: skip
         kernel.prepare_particles[blocks](
-            **surfaces, place=particles.position_N3, way=particles.velocity_NV,
+            **surfaces, scene_position=particles.position_N3, scene_velocity=particles.velocity_NV,
             sign=particles.domain_S3 if image is None else image.sign_S3, IMAGE=image is not None,
             origin=particles.origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
             fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
-            share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
+            cell_weight_of=self.cell_weight_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
             gravity=seen.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
@@ -347,9 +347,9 @@ class DeviceGrid:
         feature_kernel.prepare_relative_features[blocks](
             velocity=seen.velocity_NV, scene_of=particles.scene_N, material_of=particles.material_N,
             gravity=seen.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
-            weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, share_of=self.share_N8, motion=self.motion_C4,
-            parent=self.parents, geometry=self.geometry, features=self.feature_NF, touch_of=self.touch_N,
-            disturbed=self.disturbed_C2, felt=self.felt_C2,
+            weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, cell_weight_of=self.cell_weight_N8,
+            motion=self.motion_C4, parent=self.parents, geometry=self.geometry, features=self.feature_NF,
+            touch_of=self.touch_N, disturbed=self.disturbed_C2, felt=self.felt_C2,
             parameter_of=self.touch_N if parameter_NP is None else parameter_NP, quiet=QUIET,
             HISTORY=config.velocity_history,
             LEVELS=self.levels, NORMALS=int(config.obstacle_features), **own_physics,
@@ -372,8 +372,8 @@ class DeviceGrid:
         """Sums x's first `taken` columns by coarsest cell, launches `between`, and adds `left` columns to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
         forward, overlap = taken == OUTPUTS, overlaps()
-        pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "share_of": self.share_N8, "place_of": self.place_N3}
-        pairs |= {"particle_count": count}
+        pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "cell_weight_of": self.cell_weight_N8}
+        pairs |= {"place_of": self.place_N3, "particle_count": count}
         cells = {"neighbour": coarsest, "counts": self.counts_L, "capacity": capacity, "LEVELS": self.levels}
         sizes = {"OUT": x.shape[1], "OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
         cells_too = max(particles, capacity) if forward else particles

@@ -22,7 +22,7 @@ FREE, FULL = tl.constexpr(FREE_NEARNESS), tl.constexpr(FULL_NEARNESS)
 
 @triton.jit
 def _with_moving(
-    normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time, asked, obstacle_cell_size,
+    normal, position, velocity, row, live, scene, moving, poses, instant, scenes, time, asked, obstacle_cell_size,
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr, REACH: tl.constexpr, LAYERS: tl.constexpr,
 ):  # fmt: skip
     """Returns the normal, friction, and V (hgn.network.moving) at fractions `time` of paths [N, 8]. `normal` has those
@@ -33,7 +33,7 @@ def _with_moving(
     rough = normal[3] if ROW > 3 else none
     ux, uy, uz = none, none, none
     count = ((nx != 0) | (ny != 0) | (nz != 0)).to(tl.float32)
-    first = tl.load(turn) * scenes * LAYERS
+    first = tl.load(instant) * scenes * LAYERS
     for layer in range(LAYERS):
         number = (first + layer * scenes + scene).to(tl.int64)
         pose = poses + number * (2 * RECORD) + POSES
@@ -61,15 +61,15 @@ def _with_moving(
 
 @triton.jit
 def surfaces_of(
-    position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses, turn,
-    scenes, place_of, way_of, sign, HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
-    ROW: tl.constexpr, REACH: tl.constexpr, MOVING: tl.constexpr, IMAGE: tl.constexpr,
+    position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses, instant,
+    scenes, scene_position, scene_velocity, sign, HISTORY: tl.constexpr, OBSTACLES: tl.constexpr,
+    SYMMETRY: tl.constexpr, ROW: tl.constexpr, REACH: tl.constexpr, MOVING: tl.constexpr, IMAGE: tl.constexpr,
 ):  # fmt: skip
     """Returns three results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal
     ahead, friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0
     if no surface is within reach, at most 1. The third is V (hgn.network.moving), three components [N], if MOVING, the
-    largest number of moving obstacles of a scene, is not 0. With IMAGE positions and velocities are those of an image
-    by the scenes' `sign` [S, 3], and those of the scene are `place_of` and `way_of`, which look up obstacles."""
+    largest number of moving obstacles of a scene, is not 0. With IMAGE `position` and `velocity` are those of the image
+    by the scenes' `sign` [S, 3]. Obstacles are looked up by `scene_position` and `scene_velocity`, without image."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -86,8 +86,8 @@ def surfaces_of(
         asked = live[:, None] & (quarters <= STEPS)
         time = quarters.to(tl.float32) / STEPS
         if OBSTACLES:
-            at = place_of + row[:, None] * 3 + 0 * quarters
-            v_at = way_of + row[:, None] * (3 * HISTORY) + 0 * quarters
+            at = scene_position + row[:, None] * 3 + 0 * quarters
+            v_at = scene_velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
             x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
             y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
             z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
@@ -98,8 +98,8 @@ def surfaces_of(
             normal = none, none, none, none
         if MOVING > 0:
             normal = _with_moving(
-                normal, place_of, way_of, row, live, scene, moving, poses, turn, scenes, time + 0.0 * touch[:, None],
-                asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, REACH, MOVING,
+                normal, scene_position, scene_velocity, row, live, scene, moving, poses, instant, scenes,
+                time + 0.0 * touch[:, None], asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, REACH, MOVING,
             )  # fmt: skip
         if IMAGE:
             shown = ()
@@ -161,12 +161,12 @@ def surface_normals(surfaces, LOCAL: tl.constexpr):
 
 @triton.jit
 def add_friction(
-    surfaces, velocity, wall_friction, gravity, scale, scene, row, live, cell, share, sums, features,
+    surfaces, velocity, wall_friction, gravity, scale, scene, row, live, cell, cell_weight, sums, features,
     HISTORY: tl.constexpr, NORMALS: tl.constexpr, MOVING: tl.constexpr, LOCAL: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Writes the columns of friction to `features` [N]: the obstacle cells' with NORMALS, then the walls'.
 
-    Adds to the sums [C, COLUMNS], with the particles' weights `share` in their coarsest cells: products xx, yy, zz, yz,
+    Adds to the sums [C, COLUMNS], with the particles' `cell_weight` in their coarsest cells: products xx, yy, zz, yz,
     xz, xy of obstacle normals times friction; nearness of the six walls times friction; velocity plus gravity; and its
     square. With MOVING prepare_relative_features adds the last two, because V of particles of a pile is not known yet.
     Rule: hgn.network.own_physics.surface_friction; test: tests/kernels/test_network.py.
@@ -195,12 +195,12 @@ def add_friction(
             square += v * v
     value = with_column(value, 15, square)
     at = sums + cell[:, :, None] * COLUMNS + column[:, None, :]
-    added = share[:, :, None] * value[:, None, :]
+    added = cell_weight[:, :, None] * value[:, None, :]
     tl.atomic_add(at, added, mask=(cell >= 0)[:, :, None] & (column >= 0)[:, None, :], sem="relaxed")
 
 
 @triton.jit
-def add_drift(touch, surface, cell, share, drift):
+def add_drift(touch, surface, cell, cell_weight, drift):
     """Adds contact times V to columns 0 to 2 of the coarsest cells' `drift` [C, 8], and the contact to column 3."""
     column = tl.arange(0, 4)[None, :]
     value = tl.where(column == 3, touch[:, None], 0.0)
@@ -208,7 +208,7 @@ def add_drift(touch, surface, cell, share, drift):
         value = with_column(value, i, touch * surface[i])
     there = ((cell >= 0) & (touch > 0)[:, None])[:, :, None] & (column >= 0)[:, None, :]
     at = drift + cell[:, :, None] * 8 + column[:, None, :]
-    tl.atomic_add(at, share[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
+    tl.atomic_add(at, cell_weight[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
 
 
 settle_keys(globals())

@@ -153,14 +153,14 @@ def stopped_by_obstacles(
 
 @triton.jit
 def stopped_by_moving(
-    before, free, size, scene, live, moving, poses, turn, scenes, within, slack, least_crease,
+    before, free, size, scene, live, moving, poses, instant, scenes, within, slack, least_crease,
     SURFACES: tl.constexpr, LAYERS: tl.constexpr,
 ):  # fmt: skip
     """Returns the ends of paths from `before` to `free` that LAYERS moving obstacles stop, relative to each of them."""
     for k in tl.static_range(3):
         live = live & (free[k] > -size[k]) & (free[k] < 2 * size[k])  # NaN fails these comparisons
     ex, ey, ez = tl.where(live, free[0], 0.0), tl.where(live, free[1], 0.0), tl.where(live, free[2], 0.0)
-    endless, first = tl.zeros_like(ex) + float("inf"), tl.load(turn) * scenes * LAYERS
+    endless, first = tl.zeros_like(ex) + float("inf"), tl.load(instant) * scenes * LAYERS
     for layer in range(LAYERS):
         number = (first + layer * scenes + scene).to(tl.int64)
         pose = poses + number * (2 * RECORD) + POSES

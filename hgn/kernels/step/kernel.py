@@ -79,7 +79,7 @@ def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.con
 
 @triton.jit
 def sum_displacements(
-    x, velocity, scale, material_of, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, low, base_of,
+    x, velocity, scale, material_of, coarsest_of, cell_weight_of, place_of, felt, slot_of_cell, geometry, low, base_of,
     gate_of, spot_of, sums, particle_count,
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, RESTING: tl.constexpr,
     COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
@@ -95,8 +95,8 @@ def sum_displacements(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
     line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
-    cell, share = coarsest_cells(coarsest_of, share_of, row, live)
-    gate = tl.sum(share * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
+    cell, cell_weight = coarsest_cells(coarsest_of, cell_weight_of, row, live)
+    gate = tl.sum(cell_weight * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
     if RESTING != -1:
         gate *= (RESTING >> tl.load(material_of + row, mask=live, other=0) & 1).to(tl.float32)
     own = tl.load(coarsest_of + row * 8, mask=live, other=-1)
@@ -216,7 +216,7 @@ def stop_slow(
 @triton.jit
 def integrate(
     output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
-    near, far, barrier_table, moving, poses, turn, scenes, within, slack, least_crease, sign, OUT: tl.constexpr,
+    near, far, barrier_table, moving, poses, instant, scenes, within, slack, least_crease, sign, OUT: tl.constexpr,
     HISTORY: tl.constexpr, COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr,
     MOVING: tl.constexpr, OVERLAP: tl.constexpr, IMAGE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -281,7 +281,7 @@ def integrate(
         free = (x, y, z)
         if MOVING > 0:
             x, y, z = stopped_by_moving(
-                (bx, by, bz), free, (width, height, depth), scene, row < count, moving, poses, turn, scenes, within,
+                (bx, by, bz), free, (width, height, depth), scene, row < count, moving, poses, instant, scenes, within,
                 slack, least_crease, SURFACES, MOVING,
             )  # fmt: skip
             x = between_walls(x, bx, width, near, far, WALLED_AXES > 0)
