@@ -27,7 +27,8 @@ class ParityError(ConfigError):
 
 
 # Normalised accelerations. Latent vectors have size 1 for any output, so rounding to 11 bits (fp16, tf32) changes small
-# and large outputs by the same amount: 6e-4 on an H100, in a scene at rest. The bound is 2.5 times that.
+# and large outputs by the same amount: 6e-4 on an H100, in a scene at rest. The smallest bound, 0.05 * 0.03, is 2.5
+# times that.
 OUTPUTS = Quantity("outputs", 0.05, least=0.03)
 # The gradient of one parameter tensor. Rounding to 11 bits changes the worst of 395 tensors by 0.02 to 0.2. A gradient
 # that is missing has the error 1. `least` is 1e-7 of the largest gradients.

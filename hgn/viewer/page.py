@@ -37,7 +37,7 @@ from hgn.viewer.viser_compat import clamped, require_taken, start_server, stop_s
 STATUS_S = 0.25  # seconds between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
 TURN_DEGREES = 360.0  # rotation for a drag across the whole window
-MAXIMUM_UPLOAD_BYTES = 64 << 20
+MAXIMUM_UPLOAD_BYTES = 64 << 20  # bytes of one mesh file
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
 ACTIONS_S = 0.1  # the next frame comes before the actions that follow once actions have taken this time
 ABOUT = {

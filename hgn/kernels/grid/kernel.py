@@ -215,7 +215,7 @@ def prepare_particles(
     With MOTION (relative inputs) it writes for each particle too: the features of surfaces; its contact `touch_of` [N];
     its coarsest cells `coarsest_of` [N, 8], where repeated cells are -1; its weights `cell_weight_of` in them; and
     its place [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the
-    finest (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
+    finest (`motion` [.., 4]); places, products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
     (`moments` [C, COLUMNS]). It raises column 1 of the coarsest cells' `disturbed` [C, 2] to at least the contact times
     FULLY. With FRICTION, a number of columns, `add_friction` writes these from FRICTION_AT on and adds to `friction`
     [C, COLUMNS]. With MOVING it writes V (`surfaces_of`) to `surface_of` [N, 3], and `add_drift` adds V to `drift`
