@@ -142,6 +142,7 @@ def _write(checkpoint: dict[str, Any], path: Path, earlier: set[tuple[int, int]]
 
     with ExitStack() as copies:
         outlived(attempt, path)
+        outlived(copies.close, path)  # a repeated call has fewer to remove
 
 
 @contextmanager
