@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_589,
+    "hgn": 35_583,
     "datagen": 8_924,
     "tools": 6_279,
     "tests": 37_525,

@@ -2,7 +2,7 @@
 
 The method and its parts are those of datagen.mpm.mls_mpm. A scene of a few thousand particles needs hundreds of short
 substeps per frame. So a team computes all substeps of a scene in one launch, independently of other scenes. A team is
-one or several thread blocks that share a scene's particles and wait for each other (datagen.mpm.team_meeting). If it
+one or several thread blocks that share a scene's particles and wait for each other (datagen.mpm.team_sync). If it
 has several, all blocks of a launch must run concurrently. A team computes one scene after another.
 
 One thread for each particle computes strain, stress and contact with triangles. Each frame sorts the particles by
@@ -31,21 +31,6 @@ from datagen.mpm.mls_mpm import (
 from datagen.mpm.multiple_time_stepping import own_step
 from datagen.mpm.nodes import mark
 from datagen.mpm.team_lists import gives_now, list_acting, mark_going_on, start_lists
-from datagen.mpm.team_meeting import (
-    ACTING,
-    LEAVES,
-    MEETING,
-    SEGMENT,
-    TURN,
-    await_scene,
-    choose,
-    leave_scene,
-    meet_and_choose,
-    meet_team,
-    raise_by_warps,
-    take_turn,
-    wait,
-)
 from datagen.mpm.team_particles import (
     Share,
     Thread,
@@ -57,6 +42,21 @@ from datagen.mpm.team_particles import (
     put_symmetric,
     put_vector,
     sort,
+)
+from datagen.mpm.team_sync import (
+    ACTING,
+    LEAVES,
+    SEGMENT,
+    SYNC_LENGTH,
+    TURN,
+    await_scene,
+    choose,
+    leave_scene,
+    raise_by_warps,
+    sync_and_choose,
+    sync_team,
+    take_turn,
+    wait,
 )
 from datagen.mpm.team_transfers import gather, scatter, update_nodes
 from datagen.mpm.time_step import raise_maximum
@@ -71,7 +71,7 @@ TeamArrays = namedtuple(
     "TeamArrays",
     [
         "state", "node", "tag", "rank", "strained", "covered", "spread", "response", "hidden", "cell_count",
-        "column_count", "column_list", "block", "live", "columns", "meeting", "turn", "scene_value",
+        "column_count", "column_list", "block", "live", "columns", "sync", "turn", "scene_value",
         "counter", "setting", "law", "shape", "contact", "contact_normal", "pose", "output", "variant",
         "threads", "several", "run", "giving",
     ],
@@ -198,7 +198,7 @@ def advance(
     state_address: ti.u64, node_address: ti.u64, node_entries: ti.i32, tag: Integers, rank: Integers,
     strained: Scalars, covered: Scalars, spread: Integers, response: Scalars, hidden: Integers,
     cell_count: Integers, column_count: Integers, column_list: Integers, block: Integers, live: Integers,
-    columns: Integers, meeting: Integers, turn: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    columns: Integers, sync: Integers, turn: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2), setting: Scalars, law: Scalars, shape: Integers,
     contact: Integers, contact_normal: Vectors, pose: Scalars, output: Scalars, variant: ti.template(),
     threads: ti.template(), several: ti.template(), run: ti.template(),
@@ -213,7 +213,7 @@ def advance(
     and of mass in an interval (zero between them); node[1] has velocities, and at an interval's end the mass.
     Arrays: tag [2 * 3 * P]; work space rank, spread, response [6 * P], hidden (see grid_kernel.substep) and column_list
     [P]; zero at first are cell_count [G], column_count [G / 4], the flags in block [8 * G / 64], columns
-    [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes]; turn [scenes] is the order of the scenes, long
+    [6 * blocks * teams] and sync [SYNC_LENGTH * (teams + 1) + scenes]; turn [scenes] is the order of the scenes, long
     ones first. Scenes that failed do not change.
     """
     ti.loop_config(block_dim=threads)
@@ -232,12 +232,12 @@ def advance(
         node = node_address
         arrays = ti.static(TeamArrays(
             state, node, tag, rank, strained, covered, spread, response, hidden, cell_count, column_count,
-            column_list, block, live, columns, meeting, turn, scene_value, counter, setting, law, shape, contact,
+            column_list, block, live, columns, sync, turn, scene_value, counter, setting, law, shape, contact,
             contact_normal, pose, output, variant, threads, several, run, rank,
         ))  # fmt: skip
-        meetings = 0
+        syncs = 0
         choices = 0
-        at = (team + 1) * MEETING
+        at = (team + 1) * SYNC_LENGTH
         segment = SEGMENT * (team * blocks + part)
         thread = ti.static(Thread(lane, part, blocks, member, members, stride, velocities, at, segment, patience))
         scenes = turn.shape[0]
@@ -245,12 +245,12 @@ def advance(
         place_in_turn = 0
         if lane < threads:
             if member == 0:
-                take_turn(at, meeting)
-            # this meeting detects, before the simulation, blocks that do not run concurrently
-            meet_team(thread, meetings, arrays)
+                take_turn(at, sync)
+            # this barrier detects, before the simulation, blocks that do not run concurrently
+            sync_team(thread, syncs, arrays)
             if frames > 0 and columns[segment + LEAVES] == 0:
                 turns = scenes * ((frames + stretch - 1) // stretch)
-                place_in_turn = meeting[at + TURN]
+                place_in_turn = sync[at + TURN]
         while place_in_turn < turns:
             scene = turn[place_in_turn % scenes]
             first = shape[SHAPE.part_begin + scene]
@@ -273,7 +273,7 @@ def advance(
                         counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
                         scene_value[scene, VALUE.remaining] = frame_s
                         scene_value[scene, VALUE.frame_end] = (live[live_at + LIVE.frames] + 1) * frame_s
-                    meet_and_choose(thread, scene, meetings, choices, arrays)
+                    sync_and_choose(thread, scene, syncs, choices, arrays)
                 particles = copy * fields * stride + first
                 tags = copy * TAG.length * stride + first
                 while going:
@@ -293,7 +293,7 @@ def advance(
                     going = step > 0.0 and columns[segment + LEAVES] == 0
                     if going:
                         if begins == 1.0 and not sorted_already:
-                            sort(share, thread, copy, meetings, arrays, fields)
+                            sort(share, thread, copy, syncs, arrays, fields)
                             copy = 1 - copy
                             particles = copy * fields * stride + first
                             tags = copy * TAG.length * stride + first
@@ -308,7 +308,7 @@ def advance(
                         _strain(share, thread, particles, tags, step, begins, own_steps, some_wait, arrays)
                         wait(threads)
                         scatter(share, thread, particles, tags, begins, own_steps, step, arrays)
-                        meet_team(thread, meetings, arrays)
+                        sync_team(thread, syncs, arrays)
                         if ti.static(listed):
                             start_lists(thread, columns)
                         # the last thread has the fewest nodes, so it chooses the next step while others update theirs
@@ -317,10 +317,10 @@ def advance(
                         update_nodes(
                             thread, scene, begins, ends, some_wait, now, whole, left, gravity_time, fallen, arrays
                         )
-                        meet_team(thread, meetings, arrays)
+                        sync_team(thread, syncs, arrays)
                         if ends:
                             _move(share, thread, particles, tags, arrays)
-                            meet_and_choose(thread, scene, meetings, choices, arrays)
+                            sync_and_choose(thread, scene, syncs, choices, arrays)
                 own = lane
                 while own < owned:
                     p = dealt(own, thread, chunk)
@@ -336,14 +336,14 @@ def advance(
                     turns = 0
             if member == 0:
                 live[live_at + LIVE.copy] = copy
-                take_turn(at, meeting)
-            leave_scene((teams + 1) * MEETING + scene, lane, arrays)
-            meet_team(thread, meetings, arrays)
-            place_in_turn = meeting[at + TURN]
+                take_turn(at, sync)
+            leave_scene((teams + 1) * SYNC_LENGTH + scene, lane, arrays)
+            sync_team(thread, syncs, arrays)
+            place_in_turn = sync[at + TURN]
             if place_in_turn >= scenes and place_in_turn < turns:
-                entry = (teams + 1) * MEETING + turn[place_in_turn % scenes]
+                entry = (teams + 1) * SYNC_LENGTH + turn[place_in_turn % scenes]
                 await_scene(entry, place_in_turn // scenes * blocks, thread, arrays)
-            meet_team(thread, meetings, arrays)
+            sync_team(thread, syncs, arrays)
 
 
 @ti.kernel

@@ -16,7 +16,7 @@ import taichi as ti  # isort: skip
 from datagen.mpm import team_kernel  # isort: skip
 from datagen.mpm.device_memory import address  # isort: skip
 from datagen.mpm.host_copy import HostCopy  # isort: skip
-from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
+from datagen.mpm.team_sync import APART, SEGMENT, SYNC_LENGTH  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
 LAUNCH_SECONDS = 6.0  # target time of a launch; determines its frames. Scenes wait for each other at the launch's end
@@ -88,7 +88,7 @@ class TeamLaunch(Launch):
         self.response = ti.ndarray(ti.f32, 6 * self.particles)
         self.block = ti.ndarray(ti.i32, 8 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
-        self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING + len(self.scenes))
+        self.sync = ti.ndarray(ti.i32, (self.teams + 1) * SYNC_LENGTH + len(self.scenes))
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.room)
         self.host_copy = HostCopy()
         for array in (
@@ -157,7 +157,7 @@ class TeamLaunch(Launch):
             yield position, completed
 
     def _require_together(self) -> None:
-        if self.team.blocks > 1 and self.meeting.to_numpy()[APART]:
+        if self.team.blocks > 1 and self.sync.to_numpy()[APART]:
             raise BlocksApartError
 
     def _launch(self, frames: int, substeps: np.ndarray) -> ti.ScalarNdarray:
@@ -168,7 +168,7 @@ class TeamLaunch(Launch):
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         count = np.diff(self.particle_begin)
         self.turn.from_numpy(np.argsort(-substeps * count, kind="stable").astype(np.int32))
-        self.meeting.fill(0)
+        self.sync.fill(0)
         teams, blocks = divided(count, substeps, self.room, self.team)
         # one frame per turn: with longer turns many teams would have no scene during the last turns
         stretch = 1 if teams < len(self.scenes) else max(frames, 1)
@@ -176,7 +176,7 @@ class TeamLaunch(Launch):
             frames, stretch, teams, blocks, PATIENCE[self.team.threads > 1], self.frame_s,
             address(self.state), address(self.node), self.node.shape[0], self.tag, self.rank, self.strained,
             self.covered, self.spread, self.response, self.hidden, self.cell_count, self.column_count,
-            self.column_list, self.block, self.live, self.columns, self.meeting, self.turn, self.scene_value,
+            self.column_list, self.block, self.live, self.columns, self.sync, self.turn, self.scene_value,
             self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, self.pose, output,
             self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip

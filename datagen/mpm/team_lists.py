@@ -14,8 +14,8 @@ import taichi as ti
 
 from datagen.mpm.layout import COUNT, FIELD, SETTING, SHAPE
 from datagen.mpm.multiple_time_stepping import acts, mark_changed
-from datagen.mpm.team_meeting import ACTING, GOING_ON, WARP
 from datagen.mpm.team_particles import dealt, get_vector
+from datagen.mpm.team_sync import ACTING, GOING_ON, WARP
 
 FULL = 0xFFFFFFFF  # mask of all threads of a warp
 IDLE = -(2**31)
@@ -89,7 +89,7 @@ def mark_going_on(share: ti.template(), thread: ti.template(), particles: ti.i32
 
 @ti.func
 def start_lists(thread: ti.template(), columns: ti.template()):
-    """Sets the lists' lengths to 0. All threads of the block see this after the next meeting."""
+    """Sets the lists' lengths to 0. All threads of the block see this after the next barrier."""
     if thread.lane == 0:
         for i in ti.static(range(3)):
             columns[thread.segment + ACTING + i] = 0

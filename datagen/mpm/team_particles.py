@@ -10,14 +10,14 @@ import taichi as ti
 from datagen.mpm.device_memory import load, store
 from datagen.mpm.layout import BLOCK, BLOCK_NODES, FIELD, LIVE, SETTING, TAG
 from datagen.mpm.nodes import base_node, node_place
-from datagen.mpm.team_meeting import meet_team, wait
+from datagen.mpm.team_sync import sync_team, wait
 
 COPIED = 16  # number of fields that are copied together
 
 # Variables that the kernel's functions take as one argument.
 # Thread: the thread's number in its block, the block's number in the team, the team's number of blocks; the thread's
 # number in the team, and the team's number of threads; the number of all particles; the indices at which velocities
-# begin in `node`, the team's integers in `meeting`, the block's in `columns`; the most reads of a counter.
+# begin in `node`, the team's integers in `sync`, the block's in `columns`; the most reads of a counter.
 Thread = namedtuple(
     "Thread", ["lane", "part", "blocks", "member", "members", "stride", "velocities", "at", "segment", "patience"]
 )
@@ -81,10 +81,10 @@ def _cell(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def sort(
-    share: ti.template(), thread: ti.template(), copy: ti.i32, meetings: ti.template(), arrays: ti.template(),
+    share: ti.template(), thread: ti.template(), copy: ti.i32, syncs: ti.template(), arrays: ti.template(),
     fields: ti.template(),
 ):  # fmt: skip
-    """Copies all particles to the other copy in the order of their columns. It ends with a meeting of the team."""
+    """Copies all particles to the other copy in the order of their columns. It ends with a barrier of the team."""
     own = thread.lane
     while own < share.owned:
         p = dealt(own, thread, share.chunk)
@@ -98,7 +98,7 @@ def sort(
             listed = ti.atomic_add(arrays.columns[thread.segment], 1)
             arrays.column_list[share.first + dealt(listed, thread, share.chunk)] = cell // BLOCK
         own += arrays.threads
-    meet_team(thread, meetings, arrays)
+    sync_team(thread, syncs, arrays)
     # columns that the same block was the first to find stay together
     c = thread.lane
     while c < arrays.columns[thread.segment]:
@@ -122,7 +122,7 @@ def sort(
             arrays.cell_count[column * BLOCK + n] = begin
             begin += count
         c += arrays.threads
-    meet_team(thread, meetings, arrays)
+    sync_team(thread, syncs, arrays)
     own = thread.lane
     while own < share.owned:
         p = dealt(own, thread, share.chunk)
@@ -145,7 +145,7 @@ def sort(
                 (copy * TAG.length + i) * thread.stride + share.first + p
             ]
         own += arrays.threads
-    meet_team(thread, meetings, arrays)
+    sync_team(thread, syncs, arrays)
     c = thread.lane
     while c < arrays.columns[thread.segment]:
         column = arrays.column_list[share.first + dealt(c, thread, share.chunk)]

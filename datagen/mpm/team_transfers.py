@@ -12,8 +12,8 @@ from datagen.mpm.mls_mpm import node_velocity
 from datagen.mpm.multiple_time_stepping import change_of
 from datagen.mpm.nodes import base_node, ghost_place, node_place, node_places, second_field, spline, weights
 from datagen.mpm.team_lists import IDLE
-from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
+from datagen.mpm.team_sync import GIVING
 from datagen.mpm.time_step import falls
 
 LANES = 4  # number of components of a node

@@ -51,7 +51,7 @@ _STAGING_FRAME = 8  # frame of a launch at which the results of the launch befor
 class LocalWorker(Worker):
     """Runs a worker in a process of this machine."""
 
-    speaks = True
+    reports_often = True
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
         super().__init__()
@@ -59,14 +59,14 @@ class LocalWorker(Worker):
         self.idle = True
 
     def give(self, message: object) -> None:
-        self.idle, self.heard_at = False, time.monotonic()
+        self.idle, self.last_message_s = False, time.monotonic()
         if isinstance(message, list):
             for made in message:  # sent one by one, because a whole launch (a gigabyte) would be copied several times
-                self.tell(made)
+                self.send(made)
             message = None
-        self.tell(message)
+        self.send(message)
 
-    def tell(self, message: object) -> None:
+    def send(self, message: object) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 

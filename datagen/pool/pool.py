@@ -194,7 +194,7 @@ class Pool:
 
     def _receive(self, timeout: float) -> None:
         for worker, message in self._factory.receive((*self._makers, *self._solvers), timeout):
-            worker.heard_at = time.monotonic()
+            worker.last_message_s = time.monotonic()
             if message is not None:
                 self._handle(worker, *message)
             elif self._should_stop():  # the signal reached the whole process group
@@ -206,8 +206,8 @@ class Pool:
         slept, self._awake_at = now - self._awake_at > silence / 2, now
         for worker in (*self._makers, *self._solvers):
             if slept:  # this process was stopped too (Ctrl-Z, a frozen container)
-                worker.heard_at = now
-            elif worker.speaks and worker.tasks and now - worker.heard_at > silence:
+                worker.last_message_s = now
+            elif worker.reports_often and worker.tasks and now - worker.last_message_s > silence:
                 self._replace(worker, f"it sent nothing for {silence:.0f} s")
 
     def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
@@ -250,11 +250,11 @@ class Pool:
                     self._ready[place] = replace(made, obstacle_grid=grid)
                 return
         for solver in self._solvers:
-            held = solver.tasks.get(key)
-            if isinstance(held, MadeScene) and held.task == built.task:
+            sent = solver.tasks.get(key)
+            if isinstance(sent, MadeScene) and sent.task == built.task:
                 if not isinstance(grid, str):
-                    solver.tasks[key] = replace(held, obstacle_grid=grid)
-                solver.tell(built)
+                    solver.tasks[key] = replace(sent, obstacle_grid=grid)
+                solver.send(built)
                 return
 
     def _accept(self, task: SceneTask) -> None:
@@ -274,8 +274,8 @@ class Pool:
         self._todo.sort(key=lambda task: task.place)
 
     def _replace(self, worker: Worker, cause: str) -> None:
-        blamable = worker.blamable()
-        self._deaths_in_a_row += blamable
+        suspect = worker.task_is_suspect()
+        self._deaths_in_a_row += suspect
         halvings = self._plan.scenes_per_launch.bit_length()
         if self._deaths_in_a_row > 3 * MAXIMUM_ATTEMPTS + self._plan.solvers + halvings:
             text = f"workers keep dying before they finish any scene, the last because {cause}"
@@ -293,13 +293,13 @@ class Pool:
         for place, item in enumerate(lost):
             task = _task(item)
             if isinstance(item, GridTask):
-                self._grid_lost(item, cause, blamable)
+                self._grid_lost(item, cause, suspect)
                 continue
             if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
                 self._accept(task)
                 continue
             # any scene of a launch may be the cause, so halves are tried; deaths count only for a scene that ran alone
-            if blamable:
+            if suspect:
                 self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
                 self._group[task.key] = groups + (2 * place >= len(lost))
             if self._alone.get(task.key, 0) >= MAXIMUM_ATTEMPTS:
@@ -309,8 +309,8 @@ class Pool:
             else:
                 self._put_back(task)
 
-    def _grid_lost(self, item: GridTask, cause: str, blamable: bool) -> None:
-        deaths = self._grid_deaths[item.task] = self._grid_deaths.get(item.task, 0) + blamable
+    def _grid_lost(self, item: GridTask, cause: str, suspect: bool) -> None:
+        deaths = self._grid_deaths[item.task] = self._grid_deaths.get(item.task, 0) + suspect
         if deaths >= MAXIMUM_ATTEMPTS:
             self._grid_built(BuiltGrid(item.task, cause))
         else:

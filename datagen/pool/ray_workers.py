@@ -145,7 +145,7 @@ class RayWorker(Worker):
     def cause_of_death(self) -> str:
         return self.cause
 
-    def blamable(self) -> bool:
+    def task_is_suspect(self) -> bool:
         alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
         return not self.silent and (self.node is None or self.node in alive)
 

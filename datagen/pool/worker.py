@@ -92,19 +92,19 @@ class BuiltGrid:
 class Worker(ABC):
     """Defines the interface by which the pool uses a worker."""
 
-    speaks = False  # whether a busy worker sends messages at shorter intervals than dataset.worker_silence_s
+    reports_often = False  # whether a busy worker sends messages at shorter intervals than dataset.worker_silence_s
 
     def __init__(self) -> None:
         self.idle = False
         self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # unanswered tasks by key
         self.given = 0  # total number of scenes given to simulate
-        self.heard_at = time.monotonic()  # time of the last message in either direction
+        self.last_message_s = time.monotonic()  # time of the last message in either direction
 
     @abstractmethod
     def give(self, message: object) -> None:
         """Sends work. The next `receive` notices a dead worker."""
 
-    def tell(self, message: object) -> None:
+    def send(self, message: object) -> None:
         """Sends a worker one part of its task, for example the obstacle grid of a scene that it simulates."""
         raise NotImplementedError
 
@@ -120,7 +120,7 @@ class Worker(ABC):
     def cause_of_death(self) -> str:
         """Returns why a worker that does not answer has ended."""
 
-    def blamable(self) -> bool:
+    def task_is_suspect(self) -> bool:
         """Returns whether the worker's task may have ended it; False if its machine has left the cluster."""
         return True
 

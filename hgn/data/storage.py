@@ -401,10 +401,10 @@ def _missing(path: Path | str) -> StorageError:
 
 
 def _transient(error: Exception, url: str) -> str | None:
-    """Returns the cause of a temporary error, or None for another error. Raises: ConfigError (access refused)."""
+    """Returns the cause of a temporary error, or None for another one. Raises: StorageError (access refused)."""
     if isinstance(error, FileNotFoundError):
         return None
-    malformed = type(error.__cause__).__module__ == "aiohttp.http_exceptions"  # aiohttp invents status 400
+    malformed = type(error.__cause__).__module__ == "aiohttp.http_exceptions"  # aiohttp sets status 400 for it
     status = None if malformed else getattr(error, "status", None)
     # 416: a proxy has an older, shorter index file
     lasting = isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429)

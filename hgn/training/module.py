@@ -29,7 +29,8 @@ class TrainingModule(LightningModule):
     Optimisation is manual. Lightning's own counters do not change; `update` counts the updates.
     """
 
-    updates: Updates  # set by on_train_start
+    trained: TrainedNetwork  # set by on_train_start, as `updates`
+    updates: Updates
 
     def __init__(
         self,
@@ -80,21 +81,14 @@ class TrainingModule(LightningModule):
             self.averaged.load_state_dict(self.network.state_dict())
 
     @property
-    def result(self) -> ParticleNetwork:
-        """Returns the measured and exported network: the moving average if there is one."""
-        return self.network if self.averaged is None else self.averaged
-
-    @property
     def rate(self) -> float:
         """Returns the learning rate of the next update."""
         return learning_rate(self.training_config, self.update)
 
     def simulating_backend(self) -> Backend:
-        """Returns the backend that simulates `result`: triton if it trains, else the fastest that steps by frames."""
-        precision = self.updates.precision
-        if self.backend == "triton":
-            return build("triton", self.result, precision)
-        return fastest_stepped(self.result, precision)
+        """Returns the backend that simulates the trained network: triton if it trains, else the fastest stepped one."""
+        result, precision = self.trained.result, self.updates.precision
+        return build("triton", result, precision) if self.backend == "triton" else fastest_stepped(result, precision)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return build_optimizer(self.network, self.training_config)
@@ -103,7 +97,7 @@ class TrainingModule(LightningModule):
         config, rank = self.training_config, self.trainer.global_rank
         optimizer = self.optimizers(use_pl_optimizer=False)
         assert isinstance(optimizer, torch.optim.Adam)
-        trained = TrainedNetwork(
+        trained = self.trained = TrainedNetwork(
             self.network, optimizer, self.loss_sum, counters=self.gradient_counters, averaged=self.averaged
         )
         if self.backend == "torch":

@@ -68,7 +68,7 @@ class Monitor(Callback):
         """
         if self.checkpoints.measured_update == module.update:
             return
-        network = module.result
+        network = module.trained.result
         network.eval()
         started = time.monotonic()
         self.stores["validation"].refresh()
@@ -104,7 +104,7 @@ class Monitor(Callback):
     def _one_step(
         self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
     ) -> dict[str, float]:
-        network = module.result
+        network = module.trained.result
         ranks = {"rank": trainer.global_rank, "world_size": trainer.world_size}
         batches = frame_batches(episodes, network, FRAME_STRIDE, **ranks)
         backend = fastest_stepped(network, module.updates.precision)
@@ -129,7 +129,7 @@ class Monitor(Callback):
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
         """Returns rollout errors, averaged over the scenes that reached each frame, and the fraction that finished."""
-        simulator = Simulator(module.result, episodes[0].frame_rate_hz, module.simulating_backend())
+        simulator = Simulator(module.trained.result, episodes[0].frame_rate_hz, module.simulating_backend())
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         trials = simulate_scenes(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
         error_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)

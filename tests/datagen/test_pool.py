@@ -389,7 +389,7 @@ class StoppedWorker(LocalWorker):
         Worker.__init__(self)
         self.killed, self.idle = False, True
 
-    def tell(self, message):
+    def send(self, message):
         pass
 
     def dismiss(self, deadline_s):
@@ -427,4 +427,4 @@ def test_stopped_solver_is_replaced(make_config, monkeypatch):
     with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
         Pool(writer, recorder, Workers()).run()
     assert recorder.messages[0].startswith("a worker died (it sent nothing for 600 s); it is replaced")
-    assert solvers[0].killed and solvers[0].heard_at > 1000 and list(passes) == [250]
+    assert solvers[0].killed and solvers[0].last_message_s > 1000 and list(passes) == [250]

@@ -1,7 +1,7 @@
 """Barriers between the thread blocks of a team: counters in global memory.
 
 On a CPU a block has one thread. A block reads a counter at most `patience` times, because blocks that do not run
-concurrently would wait for each other forever. Then the block sets meeting[APART] and columns[segment + LEAVES]. All
+concurrently would wait for each other forever. Then the block sets sync[APART] and columns[segment + LEAVES]. All
 blocks leave the launch, and the launch's results are discarded.
 """
 
@@ -12,13 +12,13 @@ from datagen.mpm.layout import LIVE, SHAPE, VALUE, VARIANT
 from datagen.mpm.time_step import choose_time_step, raise_maximum
 
 WARP = 32
-MEETING = 96  # number of a team's integers; each third begins with one: arrived blocks, releases, the next turn
-TURN = 2 * MEETING // 3
+SYNC_LENGTH = 96  # number of a team's integers; each third begins with one: arrived blocks, releases, the next turn
+TURN = 2 * SYNC_LENGTH // 3
 QUEUE, APART = 0, 1  # before the teams' integers: number of turns taken, and 1 if blocks do not run concurrently
 SEGMENT, LEAVES = 6, 2  # number of a block's integers in `columns`, and the index of its flag to leave the launch
 ACTING, GOING_ON, GIVING = 3, 4, 5  # indices of the lengths of the block's lists (see team_lists)
-EVER = 2**31 - 1  # number of reads of a counter without a limit
-LOOKS = 64  # number of reads of a counter between two checks whether all leave
+NO_LIMIT = 2**31 - 1  # number of reads of a counter without a limit
+CHECK_READS = 64  # number of reads of a counter between two checks whether all leave
 
 
 @ti.func
@@ -37,47 +37,47 @@ def fence(threads: ti.template()):
 
 @ti.func
 def await_count(arrays: ti.template(), entry: ti.i32, target: ti.i32, segment: ti.i32, patience: ti.i32):
-    looks = 0
-    while looks >= 0:
-        if ti.atomic_max(arrays.meeting[entry], 0) >= target:  # Taichi has no load that bypasses the caches
-            looks = -1
+    reads = 0
+    while reads >= 0:
+        if ti.atomic_max(arrays.sync[entry], 0) >= target:  # Taichi has no load that bypasses the caches
+            reads = -1
         else:
-            looks += 1
-            if looks % LOOKS == 0:
-                apart = ti.atomic_max(arrays.meeting[APART], 0)
-                if apart > 0 or looks >= patience:
-                    ti.atomic_max(arrays.meeting[APART], 1)
+            reads += 1
+            if reads % CHECK_READS == 0:
+                apart = ti.atomic_max(arrays.sync[APART], 0)
+                if apart > 0 or reads >= patience:
+                    ti.atomic_max(arrays.sync[APART], 1)
                     arrays.columns[segment + LEAVES] = 1
-                    looks = -1
+                    reads = -1
     fence(arrays.threads)
 
 
 @ti.func
-def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.template()):
-    """Waits until the whole team has called it. Each thread then sees all writes. `meetings` counts the meetings."""
+def sync_team(thread: ti.template(), syncs: ti.template(), arrays: ti.template()):
+    """Waits until the whole team has called it. Each thread then sees all writes. `syncs` counts the calls."""
     wait(arrays.threads)
     if ti.static(arrays.several):
         if thread.lane == 0:
-            meetings += 1
+            syncs += 1
             fence(arrays.threads)
-            ti.atomic_add(arrays.meeting[thread.at], 1)
-            await_count(arrays, thread.at, meetings * thread.blocks, thread.segment, thread.patience)
+            ti.atomic_add(arrays.sync[thread.at], 1)
+            await_count(arrays, thread.at, syncs * thread.blocks, thread.segment, thread.patience)
         wait(arrays.threads)
 
 
 @ti.func
-def take_turn(at: ti.i32, meeting: ti.template()):
+def take_turn(at: ti.i32, sync: ti.template()):
     """Gives the team whose integers begin at `at` the next turn. Teams get turns in the order in which they ask."""
-    meeting[at + TURN] = ti.atomic_add(meeting[QUEUE], 1)
+    sync[at + TURN] = ti.atomic_add(sync[QUEUE], 1)
 
 
 @ti.func
 def leave_scene(entry: ti.i32, lane: ti.i32, arrays: ti.template()):
-    """Adds 1 to meeting[entry], the number of blocks that have finished a turn with the scene."""
+    """Adds 1 to sync[entry], the number of blocks that have finished a turn with the scene."""
     wait(arrays.threads)
     if lane == 0:
         fence(arrays.threads)
-        ti.atomic_add(arrays.meeting[entry], 1)
+        ti.atomic_add(arrays.sync[entry], 1)
 
 
 @ti.func
@@ -85,7 +85,7 @@ def await_scene(entry: ti.i32, count: ti.i32, thread: ti.template(), arrays: ti.
     """Waits until `count` blocks have left the scene, without a limit: the team that computes the scene is running,
     because it took its turn earlier."""
     if thread.lane == 0:
-        await_count(arrays, entry, count, thread.segment, EVER)
+        await_count(arrays, entry, count, thread.segment, NO_LIMIT)
 
 
 @ti.func
@@ -98,18 +98,18 @@ def choose(scene: ti.i32, arrays: ti.template()):
 
 
 @ti.func
-def meet_and_choose(
-    thread: ti.template(), scene: ti.i32, meetings: ti.template(), choices: ti.template(), arrays: ti.template()
+def sync_and_choose(
+    thread: ti.template(), scene: ti.i32, syncs: ti.template(), choices: ti.template(), arrays: ti.template()
 ):
-    """Waits for the team. The last block to arrive chooses the next step. `choices` counts these meetings."""
+    """Waits for the team. The last block to arrive chooses the next step. `choices` counts these calls."""
     wait(arrays.threads)
     if thread.lane == 0:
         last = 1
         if ti.static(arrays.several):
-            meetings += 1
+            syncs += 1
             choices += 1
             fence(arrays.threads)
-            if ti.atomic_add(arrays.meeting[thread.at], 1) != meetings * thread.blocks - 1:
+            if ti.atomic_add(arrays.sync[thread.at], 1) != syncs * thread.blocks - 1:
                 last = 0
         if last == 1:
             if ti.static(arrays.several):
@@ -117,9 +117,9 @@ def meet_and_choose(
             choose(scene, arrays)
             if ti.static(arrays.several):
                 fence(arrays.threads)
-                ti.atomic_add(arrays.meeting[thread.at + MEETING // 3], 1)
+                ti.atomic_add(arrays.sync[thread.at + SYNC_LENGTH // 3], 1)
         if ti.static(arrays.several):
-            await_count(arrays, thread.at + MEETING // 3, choices, thread.segment, thread.patience)
+            await_count(arrays, thread.at + SYNC_LENGTH // 3, choices, thread.segment, thread.patience)
     wait(arrays.threads)
 
 
