@@ -33,6 +33,7 @@ import file_scheduling
 import interpreter
 import torch
 import warm_server
+from tqdm import tqdm
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels run in Triton's interpreter; said before any of them is defined
@@ -86,12 +87,14 @@ def pytest_collection_finish():
 
 
 @pytest.fixture(autouse=True)
-def keep_signal_handlers():
-    """Commands that a test runs in this process leave theirs behind."""
+def keep_signal_handlers_and_no_bars():
+    """Commands that a test runs in this process leave handlers behind. An open bar would print in another test."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
     yield
     for number, handler in handlers.items():
         signal.signal(number, handler)
+    bars = [tqdm._instances.pop() for _ in range(len(tqdm._instances))]
+    assert not bars
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_583,
+    "hgn": 35_589,
     "datagen": 8_924,
     "tools": 6_279,
-    "tests": 37_525,
+    "tests": 37_528,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

@@ -219,6 +219,9 @@ class LogLines(Callback):
         if self._bar is not None:
             self._bar.close()
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self.on_train_end(trainer, pl_module)  # an open bar would print its last line after the error
+
 
 class Stopper(Callback):
     """Ends the loop on every rank between two chunks, after a checkpoint.

@@ -1,5 +1,6 @@
 """The data set of a training: its completeness, the wait for its episodes, and its progress."""
 
+import contextlib
 import math
 import sys
 import time
@@ -104,44 +105,46 @@ def wait_for_episodes(
             f"out={folder}, or set training.generate=true"
         )
     progress, seen_s = None, -math.inf
-    while not stop.requested:
-        # read before the manifest, which then has all episodes of a generator that has ended
-        running = generator is not None and generator.running
-        try:
-            store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
-            seen_s = time.monotonic()
-        except (ConfigError, OSError):
-            if time.monotonic() - seen_s > standard_patience_s():
-                raise
-            time.sleep(0.5)
-            continue
-        awaited = min(1, validation) if running else 0
-        if store is not None and len(store) >= needed and store.manifest.published("validation") >= awaited:
-            if progress is not None:
-                progress.close()
-                frames = 0 if generator is None else generator.frames_done()
-                if frames:
-                    print(estimate(config, frames, progress.format_dict["elapsed"]), file=sys.stderr)
-            return PooledStore(store, others) if others else store
-        if generator is not None:
-            if not running:
-                generator.check()
+    with contextlib.ExitStack() as shown:  # closes the bar
+        while not stop.requested:
+            # read before the manifest, which then has all episodes of a generator that has ended
+            running = generator is not None and generator.running
+            try:
+                store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
+                seen_s = time.monotonic()
+            except (ConfigError, OSError):
+                if time.monotonic() - seen_s > standard_patience_s():
+                    raise
+                time.sleep(0.5)
+                continue
+            awaited = min(1, validation) if running else 0
+            if store is not None and len(store) >= needed and store.manifest.published("validation") >= awaited:
+                if progress is not None:
+                    progress.close()
+                    frames = 0 if generator is None else generator.frames_done()
+                    if frames:
+                        print(estimate(config, frames, progress.format_dict["elapsed"]), file=sys.stderr)
+                return PooledStore(store, others) if others else store
+            if generator is not None:
+                if not running:
+                    generator.check()
+                    raise ConfigError(
+                        f"training.minimum_episodes must be reachable, got {needed} for a data set of "
+                        f"{len(store) if store else 0}; generate more scenes"
+                    )
+            elif first_rank() and (not is_remote(folder) or (store is not None and store.manifest.complete)):
                 raise ConfigError(
-                    f"training.minimum_episodes must be reachable, got {needed} for a data set of "
-                    f"{len(store) if store else 0}; generate more scenes"
+                    f"dataset.folder must contain {needed} training episodes, got {len(store) if store else 0} in "
+                    f"{folder}; generate them, or set training.generate=true"
                 )
-        elif first_rank() and (not is_remote(folder) or (store is not None and store.manifest.complete)):
-            raise ConfigError(
-                f"dataset.folder must contain {needed} training episodes, got {len(store) if store else 0} in "
-                f"{folder}; generate them, or set training.generate=true"
-            )
-        if progress is None and first_rank():
-            text = f"waiting for {needed} training and {awaited} validation episodes in {folder}"
-            print(printable(text), file=sys.stderr)
-            progress = bar("generating", total=(needed + validation) * config.dataset.frames, unit="frame")
-        if progress is not None and generator is not None:
-            advance_to(progress, min(max(generator.frames_done(), progress.n), progress.total))
-        time.sleep(0.5)
+            if progress is None and first_rank():
+                text = f"waiting for {needed} training and {awaited} validation episodes in {folder}"
+                print(printable(text), file=sys.stderr)
+                total = (needed + validation) * config.dataset.frames
+                progress = shown.enter_context(bar("generating", total=total, unit="frame"))
+            if progress is not None and generator is not None:
+                advance_to(progress, min(max(generator.frames_done(), progress.n), progress.total))
+            time.sleep(0.5)
     return None
 
 
