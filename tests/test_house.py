@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_589,
+    "hgn": 35_600,
     "datagen": 8_924,
     "tools": 6_279,
-    "tests": 37_528,
+    "tests": 37_542,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

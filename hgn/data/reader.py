@@ -23,12 +23,13 @@ import numpy as np
 from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.statistics import Statistics
-from hgn.data.storage import StorageError, ask, asked_once, faults_outlived, is_remote, open_storage, outliving
+from hgn.data.storage import Storage, StorageError, ask, asked_once, faults_outlived, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
 
 T = TypeVar("T")
+REMOVED_AT_MOST = 10  # number of fetches of a shard that other processes remove before it is read
 AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time until the fault is forgotten
 
 
@@ -256,7 +257,17 @@ class EpisodeStore(Episodes):
 
     def _bring(self, shard: ShardEntry, use: Callable[[Path], T], **options: Any) -> T:
         """Returns the result of `use` for a shard's verified file. Options and errors as for `Storage.shard`."""
-        return ask(self.folder, lambda files: use(files.shard(shard.name, shard.sha256, shard.bytes, **options)))
+
+        def bring(files: Storage) -> T:
+            for left in reversed(range(REMOVED_AT_MOST)):
+                try:
+                    return use(files.shard(shard.name, shard.sha256, shard.bytes, **options))
+                except FileNotFoundError:  # another process has removed it from a full cache
+                    if not left:
+                        raise
+            raise AssertionError
+
+        return ask(self.folder, bring)
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)

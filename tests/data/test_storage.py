@@ -218,6 +218,20 @@ def test_altered_or_cut_shards_are_refused(folder, cache):
     assert list(cache.iterdir()) == []
 
 
+def test_shards_that_other_processes_remove(folder, cache, monkeypatch):
+    """A shard that a process with the same full cache removes before it is opened is fetched again, several times."""
+    store, expected = EpisodeStore(in_memory(folder, "removed"), "train"), EpisodeStore(folder, "train")[0]
+    read, removed = hgn.data.storage._Folder.read, []
+
+    def remove_first(files, name, *given):
+        if len(removed) < 3:
+            removed.append((files._folder / name).unlink())
+        return read(files, name, *given)
+
+    monkeypatch.setattr(hgn.data.storage._Folder, "read", remove_first)
+    assert np.array_equal(store[0].position_TN3, expected.position_TN3) and len(removed) == 3
+
+
 @pytest.mark.parametrize("full", ["limit", "disk"])
 def test_full_cache(folder, cache, monkeypatch, full):
     """A data set larger than the cache's limit, or than its disk, can be read repeatedly: the oldest shards are
