@@ -3,7 +3,7 @@
 import functools
 import inspect
 from dataclasses import replace
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ def spare_repeated_work():
     builder = interpreter.interpreter_builder
     if not builder.options.debug:  # seven operations on each sum of integers, for a condition that only debug looks at
         builder.options = replace(builder.options, sanitize_overflow=False)
-    interpreter._patch_lang = PatchOnce(interpreter._patch_lang, {language, language.core})
+    _patch_once(interpreter, {language, language.core})
     find, found = interpreter._get_np_dtype, {}
 
     def np_dtype(dtype):
@@ -40,6 +40,23 @@ def spare_repeated_work():
     _remember_builtins(interpreter, language.core)
     _remember_shapes(language.core, language.semantic.TritonSemantic)
     _remember_constants(language.core, language.semantic.TritonSemantic)
+
+
+def _patch_once(interpreter, languages):
+    """Leaves the interpreter's functions in the language. Putting them there for each launch, and for each call of a
+    function in it, takes a twentieth of the kernels' time."""
+    patch, patched, kept = interpreter._patch_lang, set(), SimpleNamespace(restore=lambda: None)
+
+    @functools.cache
+    def patch_lang(function):
+        """The scope that ends with the launch."""
+        seen = languages.intersection(each for each in function.__globals__.values() if isinstance(each, ModuleType))
+        if not seen or not seen <= patched:
+            patch(function)
+            patched.update(seen)
+        return kept
+
+    interpreter._patch_lang = patch_lang
 
 
 def _remember_builtins(interpreter, core):
@@ -166,34 +183,3 @@ def _remember_shapes(core, semantic):
     core.block_type.__init__, core.tensor.__init__ = init_block, init_tensor
     core.block_type.with_element_ty = block_of
     semantic.broadcast_impl_value = broadcast_unlike
-
-
-class PatchOnce:
-    """Puts the interpreter's functions into the language once a launch, not at each call of a function in it."""
-
-    def __init__(self, patch, languages):
-        self._patch, self._languages = patch, languages
-        self._patched: set[ModuleType] = set()  # in the launch under way
-        self._seen = functools.cache(self._seen_by)
-
-    def _seen_by(self, function):
-        values = function.__globals__.values()
-        return frozenset(value for value in values if isinstance(value, ModuleType) and value in self._languages)
-
-    def __call__(self, function):
-        """The scope that ends with the launch; of functions called in it nobody looks at theirs."""
-        seen = self._seen(function)
-        if seen and seen <= self._patched:
-            return None
-        scope = self._patch(function)
-        self._patched |= seen
-        return _Scope(scope, self._patched)
-
-
-class _Scope:
-    def __init__(self, scope, patched):
-        self._scope, self._patched = scope, patched
-
-    def restore(self):
-        self._patched.clear()
-        self._scope.restore()
