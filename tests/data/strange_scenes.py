@@ -50,7 +50,6 @@ def many_names(count, folder):
 
 
 MESHES = {
-    "a spiral": saved("m.obj", spiral(990)),
     "instances": glb(instances(1500)),
     "pentagons": saved("m.obj", b"v 0 0 0\nv 9 0 0\nv 1 1 0\nv 0 9 0\nv -9 5 0\n" + 4000 * b"f 1 2 3 4 5\n"),
     "triangles of one place": saved("m.obj", TRI[:24] + 6000 * TRI[24:]),
