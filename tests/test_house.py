@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 35_600,
     "datagen": 8_924,
-    "tools": 6_279,
-    "tests": 37_527,
+    "tools": 6_278,
+    "tests": 37_536,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

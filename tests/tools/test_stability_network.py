@@ -1,7 +1,9 @@
 """python -m tools.stability network: its cases, and its measures against closed forms."""
 
+import importlib
 import json
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -257,3 +259,10 @@ def test_the_command_names_its_parts(capfd):
     assert run_module("tools.stability", ["solver", "cases=[galery]"]) == 2
     refused = capfd.readouterr().err
     assert refused.startswith("error: cases[0] must be one of steps, ") and refused.count("\n") == 1
+
+
+def test_a_signal_while_a_part_is_loaded(capfd, monkeypatch):
+    """Ctrl-C during the first seconds, in which PyTorch is loaded, ends in one line."""
+    monkeypatch.setattr(importlib, "import_module", mock.Mock(side_effect=KeyboardInterrupt))
+    assert run_module("tools.stability", ["solver"]) == 130
+    assert capfd.readouterr().err == "error: interrupted\n"

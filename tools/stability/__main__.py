@@ -3,7 +3,6 @@
 Parts are modules of this package with a `main`, each with its options in conf/command/stability_PART.yaml.
 """
 
-import importlib
 import sys
 
 from hgn.command import EXIT_INPUT, run_command
@@ -21,7 +20,7 @@ def run() -> None:
         print(f"error: the first argument must be one of {', '.join(PARTS)}, got {part}", file=sys.stderr)
         sys.exit(EXIT_INPUT)
     del sys.argv[1]
-    run_command(importlib.import_module(f"tools.stability.{part}").main, f"stability_{part}")
+    run_command(f"tools.stability.{part}", f"stability_{part}")
 
 
 if __name__ == "__main__":
