@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 35_600,
     "datagen": 8_924,
     "tools": 6_278,
-    "tests": 37_536,
+    "tests": 37_535,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

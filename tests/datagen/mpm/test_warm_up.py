@@ -9,11 +9,10 @@ from datagen.mpm.launch import Launch
 from hgn.command import _compose
 from hgn.scene.random_scene import generate_scene
 
-SCENES = 20  # of a launch; they contain all that a launch of several hundred contains
 
-
-@pytest.mark.parametrize("experiment", ["obstacles", "own_physics"])
-def test_a_warm_up_compiles_the_kernels_of_a_launch(experiment, monkeypatch):
+# these numbers of scenes contain all that a launch of several hundred contains
+@pytest.mark.parametrize(("experiment", "count"), [("obstacles", 3), ("own_physics", 20)])
+def test_a_warm_up_compiles_the_kernels_of_a_launch(experiment, count, monkeypatch):
     kernels = []
 
     class Compiled(Launch):
@@ -42,7 +41,7 @@ def test_a_warm_up_compiles_the_kernels_of_a_launch(experiment, monkeypatch):
     monkeypatch.setattr(solver, "memory_bytes", lambda _: 1e12)
     monkeypatch.setattr(solver, "TeamLaunch", Compiled)
     solver.warm_up(config.scene, config.mpm, 400)
-    scenes = [generate_scene(config.scene, 1000 + seed) for seed in range(SCENES)]
-    team = solver._team(gpu, [scene.particle_count for scene in scenes] * (400 // SCENES))
+    scenes = [generate_scene(config.scene, 1000 + seed) for seed in range(count)]
+    team = solver._team(gpu, [scene.particle_count for scene in scenes] * (400 // count))
     solver.simulate(scenes, config.mpm, 2, 60.0, team=team)
     assert len({*kernels}) == 1, kernels
