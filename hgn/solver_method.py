@@ -23,7 +23,7 @@ class SolverMethod(NamedTuple):
     # leapfrog: free fall is exact; symplectic_euler: it is ahead by g t dt / 2.
     time_integration: str
     # Particles and grid exchange velocities every cell_size / this, 32 times a frame of 1/60 s at 64 cells. Between
-    # transfers there are as many steps of stress as the materials need. None: a transfer in every step. Few transfers
+    # transfers there are as many substeps as the materials need. None: a transfer in every substep. Few transfers
     # smooth velocities less.
     transfer_speed_m_s: float | None
     # Distance in cells from a closed body thinner than a cell. Nodes outside the body within it stop motion. At least

@@ -75,7 +75,7 @@ class SceneValue(NamedTuple):
     interval_elapsed: int = 10  # time of the interval including the present substep, s
     interval_remaining: int = 11  # time after the present substep, s; at 0 particles take velocities from nodes
     begins: int = 12  # 1 if the present substep is the first of its interval, else 0
-    stability_fraction: int = 13  # longest step of stress as a fraction of the stability limit
+    stability_fraction: int = 13  # longest substep as a fraction of the stability limit
     gravity_time: int = 14  # time of gravity in the present substep, s: see mls_mpm
     water_density: int = 15  # number of particles per cell at rest; 0 if unknown
     wall_friction: int = 16  # 16, 17, 18: friction of the domain's walls normal to x, y, z

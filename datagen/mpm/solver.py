@@ -70,14 +70,12 @@ def simulate(
     """Simulates `scenes` together, and returns `frames` frames of each, the initial state included.
 
     Scenes may differ in everything but their cell size. The largest domain determines each scene's memory.
-    With adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of
-    stress if that is longer. The interval is at most SPEED_FRACTION dx / |v|max at its start. Intervals are equal up to
-    the end of the frame. Within them each scene takes its own steps of stress, of at most stability_fraction dx
-    sqrt(rho / (3 lambda_h + 2 mu_h)). With a fixed time step each step has a transfer. A frame has ceil(frame / step)
-    steps, as in Taichi Elements: 54 steps at 60 Hz and 3.125e-4 s, which are 1.25 % longer than the frame.
+    docs/concepts/solver.md has the rules for substeps and transfers. With a fixed time step each substep has a
+    transfer. A frame then has ceil(frame / step) substeps, as in Taichi Elements: 54 at 60 Hz and 3.125e-4 s, which are
+    1.25 % longer than the frame.
 
-    Scenes with emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
-    called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.
+    Scenes with emitters are simulated after the others, in a launch of their own. `on_frame(t)` is called from 0 on
+    when the scenes have completed frame t, on average over the scenes if there are two launches.
     `trajectories` are arrays for the frames of each scene, which contain frame t of a single scene in `on_frame(t)`.
     `cpu_threads` applies to the process's first simulation (see `initialise`). `colliders` are results of
     `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: it is

@@ -5,7 +5,7 @@ import taichi as ti
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 from hgn.solver_method import SPEED_FRACTION
 
-# An interval with at least this number of stress steps is synchronised (see mls_mpm). Intervals of fewer steps are
+# An interval with at least this number of substeps is synchronised (see mls_mpm). Intervals of fewer substeps are
 # stable at rest without synchronisation. But the result of an impact on the ground at 10 m/s changed by 6 % when the
 # steps were halved, so an interval that a fast particle shortens is synchronised too.
 SYNCHRONISED_FROM = 3.0

@@ -1,7 +1,7 @@
 """Computes levels, slots and middles of the grid, for the kernels of cells.
 
-The geometry table has a row for each level: first slot, number of slots, window cells in y and z with borders, slots of
-a scene, capacity, first cell in tables, window cells in x with borders. *Middles* are the centres of every 2^SHIFT-th
+The geometry table has a row for each level: first slot, number of slots, box cells in y and z with borders, slots of
+a scene, capacity, first cell in tables, box cells in x with borders. *Middles* are the centres of every 2^SHIFT-th
 coarsest cell along each axis. A *spot* is a particle's place relative to the lowest of the eight middles around it."""
 
 import triton
@@ -15,7 +15,7 @@ FULLY = tl.constexpr(1 << 24)  # number that stands for the disturbance 1 of a c
 
 @triton.jit
 def split_slot(local, ny, nz, stride):
-    """Returns the scene and the cell of a slot, counted from the level's first. A window's borders begin at cell -1."""
+    """Returns the scene and the cell of a slot, counted from the level's first. A box's borders begin at cell -1."""
     inside = local % stride
     return local // stride, inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
 
@@ -48,7 +48,7 @@ def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, cap
 @triton.jit
 def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.constexpr, SHIFT: tl.constexpr):
     """Returns the lowest middle around a particle along one axis, counted from 0, and the particle's spot, in
-    distances of two middles. `k` is the number of the particle's coarsest cell in the window."""
+    distances of two middles. `k` is the number of the particle's coarsest cell in the box."""
     first = tl.load(low + axis) >> LEVELS - 1
     place = tl.load(place_of + row * 3 + axis, mask=live, other=0.0)
     lowest = tl.floor(place)

@@ -15,7 +15,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork
-from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, DeviceImage, DeviceParticles, Window
+from hgn.kernels.grid.op import OUT_OF_BOX, OVERFLOW, CellBox, DeviceGrid, DeviceImage, DeviceParticles
 from hgn.kernels.moving import MovingTable
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
@@ -276,29 +276,29 @@ class TritonStepper:
         grid = build_hierarchy(position_N3, scene_N, origin_S3, cell_size, levels=levels, bodies=bodies)
         return first_capacities([level.cell_count for level in grid.levels], self.live)
 
-    def _window(self) -> Window:
+    def _cell_box(self) -> CellBox:
         position_N3 = self.buffers.position_N3[: self.live]
         if (image := self.buffers.image) is not None:
             scene_N = self.buffers.scene_N[: self.live].long()
             position_N3 = torch.cat([position_N3, self.buffers.domain_S3[scene_N] + image.wall_shift - position_N3])
-        box = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
+        ends = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
         size = self.buffers.domain_S3.amax(0).cpu()
-        lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
+        lower, upper = torch.minimum(ends[0], torch.zeros(3)), torch.maximum(ends[1], size)
         config = self.config
-        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
+        return CellBox.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
 
     def _build(self, capacities: tuple[int, ...]) -> None:
-        config, window = self.config, self._window()
+        config, box = self.config, self._cell_box()
         self.graph = None
-        # No level can have more than eight cells for each particle, or more than the window contains, unless bodies
+        # No level can have more than eight cells for each particle, or more than the box contains, unless bodies
         # divide its cells.
         limits = [8 * self.particles] * config.levels
         for level in range(1 if config.body_cells else config.levels):
-            limits[level] = min(limits[level], self.scenes * math.prod(n >> level for n in window.cells))
+            limits[level] = min(limits[level], self.scenes * math.prod(n >> level for n in box.cells))
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
-        more = rest_numbers(self.step_config, window, self.scenes, config.levels)
+        more = rest_numbers(self.step_config, box, self.scenes, config.levels)
         self.grid = DeviceGrid(
-            config, window, rounded, scenes=self.scenes, particles=self.particles, device=self.device, more=more
+            config, box, rounded, scenes=self.scenes, particles=self.particles, device=self.device, more=more
         )
         self.step = DeviceStep(self.step_config, self.grid, self.barriers, self.origin_range)
         tuning = replace(Tuning.of(self.precision), half_sums=self.half_sums)
@@ -398,7 +398,7 @@ class TritonStepper:
             yield path_TN3, lost
             if lost:
                 return
-            if status & (OVERFLOW | OUT_OF_WINDOW):
+            if status & (OVERFLOW | OUT_OF_BOX):
                 self._grow()
 
     def _launch(self, frames: int, half: int, ahead: int = 0) -> _LaunchedBlock:

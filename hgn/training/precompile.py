@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from hgn.config import TrainConfig
-from hgn.kernels.grid.op import Window
+from hgn.kernels.grid.op import CellBox
 from hgn.kernels.moving import MovingTable
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.triton_compat import Launches, compile_launches, noted_launches, use_target
@@ -72,8 +72,8 @@ def launches_of(
 class _Unplaced(TritonStepper):
     """A simulation whose particles have no positions."""
 
-    def _window(self) -> Window:
-        return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
+    def _cell_box(self) -> CellBox:
+        return CellBox.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
 
 
 def simulation_launches(

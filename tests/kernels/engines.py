@@ -6,7 +6,7 @@ import torch
 
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.forward import FusedNetwork
-from hgn.kernels.grid.op import DeviceGrid, DeviceParticles, Window
+from hgn.kernels.grid.op import CellBox, DeviceGrid, DeviceParticles
 from hgn.kernels.moving import MovingTable
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
@@ -26,9 +26,9 @@ def engine_of(network, state, precision="fp32", capacities=(), spare_particles=3
     capacities = capacities or tuple(max(16, 8 * particles) for _ in range(config.levels))
     box = state.position_N3.float()
     lower, upper = box.min(0).values.tolist(), box.max(0).values.tolist()
-    window = Window.around(lower, upper, config.cell_size, config.levels, 2)
-    more = rest_numbers(network.step, window, state.scene_count, config.levels)
-    grid = DeviceGrid(config, window, capacities, state.scene_count, particles + spare_particles, where, more)
+    box = CellBox.around(lower, upper, config.cell_size, config.levels, 2)
+    more = rest_numbers(network.step, box, state.scene_count, config.levels)
+    grid = DeviceGrid(config, box, capacities, state.scene_count, particles + spare_particles, where, more)
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
     count = torch.tensor([particles], dtype=torch.int32, device=where)

@@ -9,7 +9,7 @@ from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, c
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
-from hgn.kernels.grid.op import DeviceGrid, DeviceParticles, Window
+from hgn.kernels.grid.op import CellBox, DeviceGrid, DeviceParticles
 from hgn.kernels.scene_tables import BARRIER_COLUMNS, SceneHash, SceneTable
 from hgn.kernels.step.op import DeviceStep
 from hgn.network.features import ParticleState
@@ -41,8 +41,8 @@ def integrated(state, way_N3, step, table):
     """Positions after a frame on the device, from rest by these ways."""
     count, where = len(way_N3), device()
     config = NetworkConfig(levels=1, velocity_history=1)
-    window = Window.around((0.0,) * 3, (1.0,) * 3, config.cell_size, 1)
-    grid = DeviceGrid(config, window, (16,), state.scene_count, count, where)
+    box = CellBox.around((0.0,) * 3, (1.0,) * 3, config.cell_size, 1)
+    grid = DeviceGrid(config, box, (16,), state.scene_count, count, where)
     one, zero_3 = torch.ones(1, dtype=torch.int32, device=where), way_N3.new_zeros(3)
     output = way_N3.new_zeros(count, OUT)
     output[:, :3] = way_N3

@@ -15,7 +15,7 @@ from training.test_pushforward import training_of
 from training.test_symmetry import scene_with_obstacles
 from triton.runtime.errors import InterpreterError
 
-from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW
+from hgn.kernels.grid.op import OUT_OF_BOX, OVERFLOW
 from hgn.kernels.update.op import DeviceSample
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -30,7 +30,7 @@ def test_the_checker_sees_what_has_gone():
     updates = updates_of(network, 1, capacities=(64,))
     made, _ = episode(1, 5, False)
     gone = replace(made, position_TN3=made.position_TN3.clone())
-    updates.particles, updates._box = 16, (torch.zeros(3), torch.ones(3))
+    updates.particles, updates._corners = 16, (torch.zeros(3), torch.ones(3))
     for sample in (made, gone):
         updates._upload([[(sample, 1, 3)]], [1e-3])
         updates._build()
@@ -46,7 +46,7 @@ def test_the_checker_sees_what_has_gone():
 @pytest.mark.parametrize("training", [True, False])
 def test_a_pass_without_room_stays_within_memory(training):
     """If only the coarse level has too little capacity, cells of the fine level have no parent. The pass then has no
-    effect and reads no other memory. The same holds for particles outside the window, or without a position."""
+    effect and reads no other memory. The same holds for particles outside the cell box, or without a position."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.05)
     state = random_state((4, 3), obstacles=False, spread=0.9)
     precision = "fp32"
@@ -61,7 +61,7 @@ def test_a_pass_without_room_stays_within_memory(training):
             engine.backward()
     needed, capacities = engine.grid.needed_L.tolist(), engine.grid.capacities
     assert needed[0] <= capacities[0] and needed[1] > capacities[1]
-    assert int(engine.grid.status) == OVERFLOW | OUT_OF_WINDOW
+    assert int(engine.grid.status) == OVERFLOW | OUT_OF_BOX
     assert (engine.grid.parent(0)[: needed[0]] < 0).any()
     assert len(checked.launches) > 5 or device().type != "cpu"
 

@@ -17,7 +17,7 @@ from network.states import network_of, on_device, random_state
 from runtime.scenes import random_scene, rough
 
 from hgn.config import NetworkConfig
-from hgn.kernels.grid.op import DeviceGrid, Window
+from hgn.kernels.grid.op import CellBox, DeviceGrid
 from hgn.kernels.scene_tables import SceneTable
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -311,7 +311,7 @@ def test_memory_of_a_simulation(particles, side, most, monkeypatch):
     """In fp16 the network of the paper's size simulates a million particles, of which a cell has three as on
     the bench, within 2.35 KB each, and 4,296 within 0.055 GB; what is asked are 3 KB and 0.1 GB. Counted over all
     tensors of a simulation without memory: weights, state and positions on their way to the host too."""
-    monkeypatch.setattr(TritonStepper, "_window", lambda _: Window((0, 0, 0), (side, side, side)))
+    monkeypatch.setattr(TritonStepper, "_cell_box", lambda _: CellBox((0, 0, 0), (side, side, side)))
     cells = tuple(round(share * particles) for share in (0.32, 0.0569, 0.0107, 0.0015))
     before = set(on_meta())
     with torch.device("meta"):
@@ -340,12 +340,12 @@ def test_growing_gives_back_first(monkeypatch):
     old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
     build, asked = DeviceGrid.__init__, []
 
-    def refuse(grid, config, window, capacities, **rest):
+    def refuse(grid, config, box, capacities, **rest):
         gc.collect()
         asked.append((capacities, [one() for one in old]))
         if len(asked) == 1:
             raise torch.OutOfMemoryError("no room")
-        build(grid, config, window, capacities, **rest)
+        build(grid, config, box, capacities, **rest)
 
     monkeypatch.setattr(DeviceGrid, "__init__", refuse)
     done = []

@@ -148,7 +148,7 @@ def assembled(updates, *samples, room=512):
     count = sum(sample[0].particles for sample in samples)
     if updates.particles == 0:
         updates.particles, updates.capacities = 16 * math.ceil(count / 16), (room,)
-        updates._box = (torch.zeros(3), torch.ones(3))
+        updates._corners = (torch.zeros(3), torch.ones(3))
         updates._build()
     updates._assemble()
     return updates.buffers.velocity_NV[:count].cpu().view(count, HISTORY, 3)

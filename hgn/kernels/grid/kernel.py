@@ -1,7 +1,7 @@
 """Builds the grid hierarchy on the device: marks, numbers and tables of cells. Nothing here waits for the host.
 With `network.inputs: local` hgn.kernels.grid.bodies divides the cells among bodies.
 
-One array of slots holds all levels of all scenes. Each level has a window of cells around the domain with a border of
+One array of slots holds all levels of all scenes. Each level has a box of cells around the domain with a border of
 one cell, so that neighbours need no check of bounds. Shape legend: N particles, C cells of a level, L levels.
 """
 
@@ -12,7 +12,7 @@ import triton.language as tl
 
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, raise_disturbed, split_slot
 from hgn.kernels.grid.bodies import body_of_slot, number_of
-from hgn.kernels.grid.slots import OUT_OF_WINDOW, OVERFLOW, base_cell, cell_in, marked, number_in, slot_of, slots_of
+from hgn.kernels.grid.slots import OUT_OF_BOX, OVERFLOW, base_cell, cell_in, marked, number_in, slot_of, slots_of
 from hgn.kernels.grid.surfaces import add_drift, add_friction, surface_normals, surfaces_of
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
@@ -65,7 +65,7 @@ def mark_cells(
     x, y, z, fx, fy, fz, inside = base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     lost = tl.sum((live & (inside == 0)).to(tl.int32), 0)
     if lost > 0:
-        tl.atomic_or(status, OUT_OF_WINDOW)
+        tl.atomic_or(status, OUT_OF_BOX)
     upper_x, upper_y, upper_z = x + (fx > 0).to(tl.int32), y + (fy > 0).to(tl.int32), z + (fz > 0).to(tl.int32)
     levels = ()
     for level in tl.static_range(1 if BODIES else LEVELS):

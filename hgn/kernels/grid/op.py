@@ -32,17 +32,17 @@ MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots of a program; the interpreter needs few programs
 SUMS = 16  # number of columns of the coarsest cells' sums, and of the decoder's padded output
-MARGIN_CELLS = 4  # margin of a window around the box that it must contain
+MARGIN_CELLS = 4  # margin of a cell box around the corners that it must contain
 UNITE_BLOCK = FILL_BLOCK // 4  # slots of a program with eight corners each
 NUMBER_BLOCK = 4096  # entries of a program
-OVERFLOW, OUT_OF_WINDOW = slots.OVERFLOW.value, slots.OUT_OF_WINDOW.value
+OVERFLOW, OUT_OF_BOX = slots.OVERFLOW.value, slots.OUT_OF_BOX.value
 
 
 @dataclass(frozen=True)
-class Window:
+class CellBox:
     """Names the cells of the finest level that exist in every scene: `low` to `low + cells - 1` on each axis.
 
-    Both are multiples of 2^(levels - 1), so that a parent lies inside or outside the window as a whole.
+    Both are multiples of 2^(levels - 1), so that a parent lies inside or outside the box as a whole.
     """
 
     low: tuple[int, int, int]
@@ -51,8 +51,8 @@ class Window:
     @staticmethod
     def around(
         lower_3: Sequence[float], upper_3: Sequence[float], cell_size: float, levels: int, margin: int = MARGIN_CELLS
-    ) -> Window:
-        """Returns the window of all cells within `margin` cells of a box. The box is in domain units."""
+    ) -> CellBox:
+        """Returns the box of all cells within `margin` cells of two corners in domain units."""
         unit = 1 << (levels - 1)
         low, cells = [], []
         for lower, upper in zip(lower_3, upper_3, strict=True):
@@ -60,7 +60,7 @@ class Window:
             last = math.ceil(upper / cell_size) + margin + 1
             low.append(first)
             cells.append(math.ceil((last - first + 1) / unit) * unit)
-        return Window((low[0], low[1], low[2]), (cells[0], cells[1], cells[2]))
+        return CellBox((low[0], low[1], low[2]), (cells[0], cells[1], cells[2]))
 
 
 def own_physics_column(config: NetworkConfig) -> int:
@@ -149,7 +149,7 @@ class DeviceGrid:
     def __init__(
         self,
         config: NetworkConfig,
-        window: Window,
+        box: CellBox,
         capacities: Sequence[int],
         scenes: int,
         particles: int,
@@ -159,11 +159,11 @@ class DeviceGrid:
         """Allocates for callers also int32 tensors `more_cleared` of sizes `more`, which `build` clears too."""
         assert scenes < SCENE_LIMIT
         relative, features = config.relative, feature_columns(config)
-        self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
+        self.scenes, self.capacities, self.particles = scenes, tuple(capacities), particles
         self.config, self.cell_size, self.levels, self.features = config, config.cell_size, len(capacities), features
         rows, start, at = [], 0, 0
         for level, capacity in enumerate(capacities):
-            nx, ny, nz = ((n >> level) + 2 for n in window.cells)
+            nx, ny, nz = ((n >> level) + 2 for n in box.cells)
             rows.append([start, scenes * nx * ny * nz, ny, nz, nx * ny * nz, capacity, at, nx])
             start += rows[-1][1]
             at += capacity
@@ -178,7 +178,7 @@ class DeviceGrid:
             return torch.zeros(shape, dtype=torch.int32, device=device)
 
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
-        self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
+        self.low = torch.tensor(box.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
         self._widths, self.friction, rough = physics_widths(config), 0, coarsest * ("friction" in config.own_physics)
         drifting = coarsest * ("moving" in config.own_physics)

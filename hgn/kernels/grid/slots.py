@@ -7,7 +7,7 @@ from hgn.kernels.geometry import GEOMETRY_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 
 OVERFLOW = tl.constexpr(1)  # status bit: a level has more active cells than its capacity
-OUT_OF_WINDOW = tl.constexpr(2)  # status bit: a particle is not finite or outside the window
+OUT_OF_BOX = tl.constexpr(2)  # status bit: a particle is not finite or outside the cell box
 
 
 @triton.jit
@@ -20,8 +20,8 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 
 @triton.jit
 def base_cell(position, origin, scene, row, live, low, geometry, cell_size):
-    """Returns the lowest of each particle's 8 cells, the particle's fractions in it, and whether the window contains
-    all 8. Cells are counted from the window's first one. The lowest cell is 0 if the window does not contain all 8."""
+    """Returns the lowest of each particle's 8 cells, the particle's fractions in it, and whether the cell box contains
+    all 8. Cells are counted from the box's first one. The lowest cell is 0 if the box does not contain all 8."""
     x, fx = _base(position, origin, scene, row, live, 0, cell_size)
     y, fy = _base(position, origin, scene, row, live, 1, cell_size)
     z, fz = _base(position, origin, scene, row, live, 2, cell_size)

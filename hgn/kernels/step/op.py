@@ -12,7 +12,7 @@ import torch
 import triton
 
 from hgn.kernels.buffers import OUT
-from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, DeviceGrid, DeviceParticles, Window
+from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, CellBox, DeviceGrid, DeviceParticles
 from hgn.kernels.moving import MovingTable, arguments_of
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step import kernel
@@ -52,9 +52,9 @@ class RestLevel:
         return RestLevel(bodies, sums, table, base_N, spot_N3, gate_N, slow_N3)
 
 
-def rest_numbers(step: StepConfig, window: Window, scenes: int, levels: int) -> tuple[int, ...]:
+def rest_numbers(step: StepConfig, box: CellBox, scenes: int, levels: int) -> tuple[int, ...]:
     """Returns the sizes of the sums of rest, which the grid clears. All cell sizes have the coarsest cells' slots."""
-    middles = scenes * math.prod((n >> levels - 1) + 2 for n in window.cells)
+    middles = scenes * math.prod((n >> levels - 1) + 2 for n in box.cells)
     return tuple(columns * middles for columns in REST_SUMS * REST_SIZES * step.rests)
 
 

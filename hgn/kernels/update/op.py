@@ -19,7 +19,7 @@ import triton
 from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.capture import captured
-from hgn.kernels.grid.op import OUT_OF_WINDOW, DeviceGrid, DeviceParticles, Window
+from hgn.kernels.grid.op import OUT_OF_BOX, CellBox, DeviceGrid, DeviceParticles
 from hgn.kernels.moving import NONE_MOVES, EpisodeMoving, MovingTable
 from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import pack_network
@@ -147,7 +147,7 @@ class Updates:
         self.particles = 0
         self.growths = 0  # number of times that the buffers grew
         self.captures, self.capture_seconds = 0, 0.0
-        self._box = (torch.zeros(3), torch.zeros(3))  # corners of the box that the window must contain
+        self._corners = (torch.zeros(3), torch.zeros(3))  # corners, in domain units, of what the cell box must contain
         self._graphs: list[torch.cuda.CUDAGraph] = []
         self._samples = self._vectors = self._rates = self._ema_weights = torch.empty(0)
 
@@ -189,7 +189,7 @@ class Updates:
         """Uploads the tables of a chunk, and grows buffers if necessary."""
         assert len(chunk) == len(rates)
         particles = self._upload(chunk, rates)
-        if particles > self.particles or not self._inside(self._box):
+        if particles > self.particles or not self._inside():
             self.particles = max(self.particles, 16 * math.ceil(particles / 16))
             self._build()
 
@@ -230,7 +230,7 @@ class Updates:
             self.moving.write(moving, symmetries)
         self.update.zero_()
         largest = torch.from_numpy(vectors[:, 0]).amax(0)
-        self._box = (self._box[0], torch.maximum(self._box[1], largest))
+        self._corners = (self._corners[0], torch.maximum(self._corners[1], largest))
         return most
 
     def allocate_moving(self, layers: int) -> None:
@@ -361,8 +361,9 @@ class Updates:
         self.grid.build(self.buffers)
         self.grid.prepare(self.buffers, self.scale, self.obstacles, self.symmetry, self.moving)
 
-    def _inside(self, box: tuple[torch.Tensor, torch.Tensor]) -> bool:
-        return bool((self._built_box[0] <= box[0]).all() and (self._built_box[1] >= box[1]).all())
+    def _inside(self) -> bool:
+        (low, high), (built_low, built_high) = self._corners, self._built_corners
+        return bool((built_low <= low).all() and (built_high >= high).all())
 
     def _build(self) -> None:
         """Allocates buffers for `particles` and `capacities`. It first measures capacities that are unknown."""
@@ -370,7 +371,7 @@ class Updates:
         self._graphs = []
         if hasattr(self, "fused"):
             del self.fused, self.grid  # frees the old buffers before the allocation of the new ones
-        self._built_box = self._box
+        self._built_corners = self._corners
         self.buffers = DeviceParticles.empty(
             particles, self.scenes, config.velocity_history, device, config.own_physics
         )
@@ -392,18 +393,18 @@ class Updates:
         )
 
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
-        config, (lower, upper) = self.config, self._box
-        window = Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
+        config, (lower, upper) = self.config, self._corners
+        box = CellBox.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
         sums = 4 * sum(capacities) * (self.training.cell_mean_weight > 0)
-        return DeviceGrid(config, window, capacities, self.scenes, self.particles, self.device, more=(sums,))
+        return DeviceGrid(config, box, capacities, self.scenes, self.particles, self.device, more=(sums,))
 
     def _grow(self, status: int, needed: list[int]) -> None:
-        if status & OUT_OF_WINDOW:
+        if status & OUT_OF_BOX:
             position = self.buffers.position_N3[: int(self.buffers.count)]
             if not bool(position.isfinite().all()):
                 raise ConfigError("positions of the training episodes must be finite, got some that are not")
             low, high = position.amin(0).cpu(), position.amax(0).cpu()
-            self._box = (torch.minimum(self._box[0], low), torch.maximum(self._box[1], high))
+            self._corners = (torch.minimum(self._corners[0], low), torch.maximum(self._corners[1], high))
         grown = self._rounded(needed)
         self.capacities = tuple(
             c if n <= c else max(c, g) for c, n, g in zip(self.capacities, needed, grown, strict=True)

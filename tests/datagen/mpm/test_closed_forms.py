@@ -105,7 +105,7 @@ def free_fall_of_taichi_elements():
 
 def momentum():
     """Three colliding blocks keep their total momentum to 1e-5 of each one's, with adaptive and fixed steps, and over
-    intervals of many steps of stress, as stiff ones take them."""
+    intervals of many substeps, as stiff ones take them."""
     scene = joined(
         block(WATER, (0.3, 0.4, 0.4), (0.42, 0.55, 0.55), (2, 0.3, 0), gravity=NO_GRAVITY),
         block(SNOW, (0.5, 0.42, 0.4), (0.6, 0.57, 0.55), (-2, 0, 0.1), seed=1),

@@ -1,4 +1,4 @@
-"""Transfers between particles and grid come at a rate of their own, with steps of stress between them."""
+"""Transfers between particles and grid come at a rate of their own, with substeps between them."""
 
 import dataclasses
 
@@ -69,7 +69,7 @@ def test_what_is_stiff_leaves_water_as_it_is():
 
 
 def test_a_transfer_at_every_step_smooths(every_step):
-    """With a transfer at every step of stress the same water is smoothed by the neighbour's steps."""
+    """With a transfer at every substep the same water is smoothed by the neighbour's steps."""
     scene = cube((1, -3, 0))
     none = run(scene, CONFIG, 3)
     assert none.counters["transfers"] == none.counters["substeps"]
@@ -83,7 +83,7 @@ def with_stiff(soft, stiff, times):
 
 
 def test_particles_take_steps_of_their_own(monkeypatch):
-    """Sand that falls on the floor takes two steps of stress an interval far from a stiff body that takes eight: it
+    """Sand that falls on the floor takes two substeps an interval far from a stiff body that takes eight: it
     acts three times, the first and the last for half a step. It lands where it does alone, and five times nearer to
     where an eighth of the step takes it, as stresses act about the time that they are of.
     """
@@ -124,7 +124,7 @@ def shaken(scenes, frames):
 
 
 def test_what_is_stiff_rests():
-    """A block that takes several steps of stress an interval lies still on the floor: after 0.15 s it moves by less
+    """A block that takes several substeps an interval lies still on the floor: after 0.15 s it moves by less
     than 0.01 cells a second, and has not left its place (it danced, since transfers found velocities half a step
     ahead).
     """
