@@ -35,14 +35,14 @@ def add_above(sums, parent, geometry, cell, there, LEVELS: tl.constexpr):
 
 
 @triton.jit
-def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
-    """Writes to column `part` of `felt` [C, 2] the maximum of column `part` of `disturbed` [C, 2], divided by FULLY,
+def most_around(disturbed, spread, part: tl.constexpr, neighbour, cell, there, capacity):
+    """Writes to column `part` of `spread` [C, 2] the maximum of column `part` of `disturbed` [C, 2], divided by FULLY,
     over a coarsest cell and the cells across its faces."""
     most = tl.load(disturbed + cell * 2 + part, mask=there, other=0)
     for slot in tl.static_range(6):
         other = tl.load(neighbour + slot * capacity + cell, mask=there, other=-1)
         most = tl.maximum(most, tl.load(disturbed + other * 2 + part, mask=other >= 0, other=0))
-    tl.store(felt + cell * 2 + part, most.to(tl.float32) / FULLY, mask=there)
+    tl.store(spread + cell * 2 + part, most.to(tl.float32) / FULLY, mask=there)
 
 
 @triton.jit

@@ -228,17 +228,17 @@ def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], 
 
 
 def surface_velocity(
-    touch_N: torch.Tensor, surface_N3: torch.Tensor, touched_C: torch.Tensor, grid: GridHierarchy
+    contact_N: torch.Tensor, surface_N3: torch.Tensor, contact_C: torch.Tensor, grid: GridHierarchy
 ) -> torch.Tensor:
     """Returns the velocity V of the surface for each particle, t V_own + (1 - t) V_mean, [N, 3].
 
-    t is the particle's contact, `touch_N`. V_own is its row of `surface_N3`, 0 at walls. V_mean is the mean of V_own,
+    t is the particle's contact, `contact_N`. V_own is its row of `surface_N3`, 0 at walls. V_mean is the mean of V_own,
     weighted by t, over the particles in the same coarsest cells and in their face neighbours.
     """
-    level, gate_C1 = grid.levels[-1], touched_C[:, None]
-    sum_C4 = grid.coarsest.sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))
+    level, gate_C1 = grid.levels[-1], contact_C[:, None]
+    sum_C4 = grid.coarsest.sums(contact_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))
     sum_C4 = sum_C4.index_add(0, level.receiver_E, sum_C4[level.sender_E])
     mean_C3 = sum_C4[:, :3] / sum_C4[:, 3:].clamp(min=TINY)
     near_N3, gate_N1 = grid.coarsest.at_particles(torch.cat([gate_C1 * mean_C3, gate_C1], -1)).split([3, 1], 1)
     near_N3 = near_N3 / gate_N1.clamp(min=TINY)
-    return touch_N[:, None] * surface_N3 + (1 - touch_N)[:, None] * near_N3
+    return contact_N[:, None] * surface_N3 + (1 - contact_N)[:, None] * near_N3

@@ -10,7 +10,7 @@ default parameters. If all are 0, they are not computed; the result is the same.
 | 1 for each of INPUT_PARAMETERS | `scaled_parameters`, 0 for parameters of other materials | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 
-A cell's matrix P (`relative.touched_normals`) is the sum of a_s n_s n_s^T over surfaces s with normals n_s and weights
+A cell's matrix P (`relative.contact_normals`) is the sum of a_s n_s n_s^T over surfaces s with normals n_s and weights
 a_s. With Q = (1 + P / e)^-1, e = FEW + RARE tr P, surfaces without friction remove T = Q R from the mean acceleration R
 (`relative.balanced`). R - T = P y with y = T / e, so surface s pushes with a_s (n_s . y) n_s. Friction mu_s keeps k T:
 

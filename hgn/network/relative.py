@@ -13,8 +13,8 @@ cube. The columns are, in this order:
 | 6 | `wall_nearness`, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
-G = sum_C w_pC t_C, with t_C = `touched` of `disturbance`, is at least the particle's own `surface_gate`. G is above 0
-if a surface is within reach of some particle in the same coarsest cells, or in their face neighbours, as in a pile.
+G = sum_C w_pC t_C, with t_C = `contact` of `disturbance`, is at least the particle's own `particle_contact`. G is above
+0 if a surface is within reach of some particle in the same coarsest cells, or in their face neighbours, as in a pile.
 
 The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
 them. These properties hold for any parameters:
@@ -50,10 +50,10 @@ FEW, RARE = 0.1, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Contacts of the coarsest cells: the two results of `disturbance` [C], 0 to 1, and `touched_normals` [C, 3, 3]."""
+    """Contacts of the coarsest cells: the two results of `disturbance` [C], 0 to 1, and `contact_normals` [C, 3, 3]."""
 
     disturbed_C: torch.Tensor
-    touched_C: torch.Tensor
+    contact_C: torch.Tensor
     normal_C33: torch.Tensor
     friction: SurfaceFriction | None = None  # None: no surface has friction
 
@@ -84,16 +84,16 @@ def relative_features(
         ],
         dim=-1,
     )
-    local, touch_N = config.body_cells, surface_gate(wall_N6, normal_N6, config.obstacle_distance)
-    normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6, local), grid)
-    disturbed_C, touched_C = disturbance(motion_NK, touch_N, grid)
+    local, contact_N = config.body_cells, particle_contact(wall_N6, normal_N6, config.obstacle_distance)
+    normal_C33 = contact_normals(surface_normals(wall_N6, normal_N6, local), grid)
+    disturbed_C, contact_C = disturbance(motion_NK, contact_N, grid)
     if surface_N3 is not None:
-        velocity_N3 = velocity_N3 - surface_velocity(touch_N, surface_N3, touched_C, grid)
+        velocity_N3 = velocity_N3 - surface_velocity(contact_N, surface_N3, contact_C, grid)
     friction = None
     if has_friction(state) and "friction" in config.own_physics:
         friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale, local=local)
-    contacts = Contacts(disturbed_C, touched_C, normal_C33, friction)
-    gate_N1 = grid.coarsest.at_particles(touched_C[:, None])
+    contacts = Contacts(disturbed_C, contact_C, normal_C33, friction)
+    gate_N1 = grid.coarsest.at_particles(contact_C[:, None])
     parts = [motion_NK, gate_N1 * torch.asinh(velocity_N3 / scale), wall_N6]
     return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 
@@ -149,7 +149,7 @@ def obstacle_surfaces(
     return torch.cat([here_NV, first_surface(ahead)], dim=-1)
 
 
-def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distance: bool) -> torch.Tensor:
+def particle_contact(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distance: bool) -> torch.Tensor:
     """Returns contacts of particles [N]: 1 with an obstacle normal, else twice the largest wall nearness, at most 1.
 
     With `distance` (network.obstacle_distance) the length of a normal is its nearness, and counts as that of a wall.
@@ -177,13 +177,13 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, local
     return normal_N33 + first_N3[:, :, None] * first_N3[:, None, :]
 
 
-def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
+def contact_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
     """Returns P [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
     return grid.coarsest.sums(normal_N33.flatten(1)).unflatten(1, (3, 3))
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:
-    """Returns Q = (1 + P / (FEW + RARE tr P))^-1 [C, 3, 3] of the `touched_normals` P.
+    """Returns Q = (1 + P / (FEW + RARE tr P))^-1 [C, 3, 3] of the `contact_normals` P.
 
     Q projects on directions that surfaces leave free. Away from surfaces it is 1. Near a plane it is 1 along the plane
     and almost 0 along its normal. Between two planes it is 1 only along their common edge.
@@ -194,25 +194,25 @@ def slip(normal_C33: torch.Tensor) -> torch.Tensor:
 
 
 def disturbance(
-    motion_NK: torch.Tensor, touch_N: torch.Tensor, grid: GridHierarchy
+    motion_NK: torch.Tensor, contact_N: torch.Tensor, grid: GridHierarchy
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns `disturbed` and `touched` of each coarsest cell, [C] each, from 0 to 1.
+    """Returns `disturbed` and `contact` of each coarsest cell, [C] each, from 0 to 1.
 
-    `disturbed` is 0 if all particles around fly freely with one velocity. A particle is disturbed by a
-    surface within reach (`surface_gate`), or if a column of history or surroundings is not small compared with QUIET. A
-    coarsest cell is as disturbed as the most disturbed particle in it and in its face neighbours. These cells
-    count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
+    `disturbed` is 0 if all particles around fly freely with one velocity. A particle is disturbed by a surface within
+    reach (`particle_contact`), or if a column of history or surroundings is not small compared with QUIET. A coarsest
+    cell is as disturbed as the most disturbed particle in it and in its face neighbours. These cells count because an
+    impact crosses a body within one frame. `contact` is computed in the same way, from surfaces only.
     """
-    own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
+    own_N = (contact_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
     groups, cell_G8, coarsest = grid.groups, grid.coarsest.centre_G8, grid.levels[-1]
 
-    def felt(value_N: torch.Tensor) -> torch.Tensor:
+    def spread(value_N: torch.Tensor) -> torch.Tensor:
         own_G = value_N.new_zeros(groups.count).scatter_reduce(0, groups.group_N, value_N, "amax")
         own_C, own_G8 = value_N.new_zeros(coarsest.cell_count), own_G[:, None].expand(-1, 8)
         own_C = own_C.scatter_reduce(0, cell_G8.flatten(), own_G8.flatten(), "amax")
         return own_C.scatter_reduce(0, coarsest.receiver_E, own_C[coarsest.sender_E], "amax")
 
-    return felt(own_N), felt(touch_N)
+    return spread(own_N), spread(contact_N)
 
 
 def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -> torch.Tensor:
@@ -222,7 +222,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
 
         w_pC               weight of particle p in coarsest cell C
         M_C, R_C, sigma_C  mass of the cell, its mean acceleration and its mean stress, with these weights
-        d_C, t_C           disturbed and touched (see `disturbance`)
+        d_C, t_C           disturbance and contact (see `disturbance`)
         e                  unit vector from the cell to its neighbour C'
         f, f'              M_C / (M_C + M_C') and 1 - f
 
@@ -237,10 +237,10 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
       and -f T in C'. It is multiplied by q, and the rotation W about the pair's centre is subtracted. In the cell this
       gives f' (q T + W x D) - W x y_p. Here I = I_C f + I_C' f' + f f' (D^2 - D D^T) and J = -f f' D x T.
 
-    t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
+    t_C Q_C R_C is subtracted too, where Q is `slip` of the `contact_normals`. Then the mean force of surfaces on a cell
     is along their normals, for any parameters. Friction keeps a part of Q_C R_C (`own_physics.friction_fraction`).
     """
-    disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
+    disturbed_C, contact_C = contacts.disturbed_C, contacts.contact_C
     level, coarsest = grid.levels[-1], grid.coarsest
     mass_C1, centre_C3, inertia_C33 = coarsest.bodies
     mean_C3, known_C, turn_C3 = coarsest.motion(output_N9[:, :3])
@@ -250,8 +250,8 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     towards_E3 = DIRECTION_63.to(mean_C3)[level.direction_E]
     traction_E3 = ((stress_C33[receiver_E] + stress_C33[sender_E]) @ towards_E3[..., None]).squeeze(-1)
     share_E = 0.5 * disturbed_C[sender_E] * mass_C[sender_E] / (mass_C[sender_E] + mass_C[receiver_E])
-    free_C = 1 - touched_C
-    own_C = disturbed_C * (touched_C + free_C * known_C)
+    free_C = 1 - contact_C
+    own_C = disturbed_C * (contact_C + free_C * known_C)
     apart_E3 = towards_E3 + centre_C3[sender_E] - centre_C3[receiver_E]
     part_E = mass_C[receiver_E] / (mass_C[sender_E] + mass_C[receiver_E])
     both_E = part_E * (1 - part_E)
@@ -266,14 +266,14 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     if contacts.friction is not None:
         pushed_C3 = torch.zeros_like(along_C3).index_add(0, receiver_E, share_E[:, None] * push_E3)
         free_C3 = (slip_C33 @ (contacts.friction.velocity_C3 + disturbed_C[:, None] * pushed_C3)[..., None]).squeeze(-1)
-        force_C3 = (disturbed_C * touched_C)[:, None] * along_C3
+        force_C3 = (disturbed_C * contact_C)[:, None] * along_C3
         push_C3 = force_C3 / (FEW + RARE * trace(contacts.normal_C33))[:, None]
         part_C = friction_fraction(contacts.friction, force_C3, push_C3, free_C3, slip_C33)
         along_C3 = along_C3 - part_C[:, None] * along_C3
-    change_C3 = change_C3 - touched_C[:, None] * along_C3
+    change_C3 = change_C3 - contact_C[:, None] * along_C3
     change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
-    felt_E = 0.5 * disturbed_C[sender_E]
-    turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)
+    half_E = 0.5 * disturbed_C[sender_E]
+    turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, half_E[:, None] * turn_E3)
     turn_C3 = disturbed_C[:, None] * turn_C3
     own_N1, change_N3 = coarsest.field(own_C, change_C3, turn_C3)
     return own_N1 * output_N9[:, :3] + change_N3

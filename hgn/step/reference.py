@@ -9,7 +9,7 @@ docs/concepts/constraints.md derives the constraints. `Deformation` computes the
     (P u)_p = sum_K w_pK min(1, 2 q_K) (u_p - mean_K - Omega_K x y_pK),    accelerations become a - P (phi P (v + a))
 
     K        centre of a coarsest cell; its mean, rotation and centre of mass use the weights w_pK
-    w_pK     trilinear weight of centre K at particle p, times the particle's gate sum_C w_pC t_C (t = touched)
+    w_pK     trilinear weight of centre K at particle p, times the particle's gate sum_C w_pC t_C (t = contact)
     mean_K   mean of u; Omega_K is the rate of rotation of u; y_pK is the place of p relative to the centre of mass
     q_K      1 where the rotation is determined by the particles, 0 where it is not (`rotation`)
     phi      2 - |d|^2 / (threshold |g|)^2, clamped to 0 to 1, for d = P (v + a)
@@ -90,8 +90,8 @@ def rested(
     assert prediction.contacts is not None and prediction.grid is not None
     scale = network.normaliser.acceleration_std[0]
     widely_M = torch.tensor(rests_widely(network.config.materials), dtype=scale.dtype, device=scale.device)
-    touched_C = prediction.contacts.touched_C
-    return rest(prediction.acceleration_N3, state, touched_C, prediction.grid, step.rest_threshold, scale, widely_M)
+    contact_C = prediction.contacts.contact_C
+    return rest(prediction.acceleration_N3, state, contact_C, prediction.grid, step.rest_threshold, scale, widely_M)
 
 
 def advanced(state: ParticleState, acceleration_N3: torch.Tensor, step: StepConfig, dimensions: int) -> ParticleState:
@@ -144,16 +144,16 @@ class Deformation:
     """The operator P on cells 2^shift times as large as the coarsest cells of a grid.
 
     Called with a field [N, 3], it returns the deformation part of the field [N, 3].
-    Weights are multiplied by `touched_C` of the cells, and by `share_N` of the particles.
+    Weights are multiplied by `contact_C` of the cells, and by `weight_N` of the particles.
     """
 
     def __init__(
-        self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, share_N: torch.Tensor | None = None
+        self, contact_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, weight_N: torch.Tensor | None = None
     ) -> None:
-        coarsest, corner_83 = grid.coarsest, CORNER_83.to(touched_C.device)
-        gate_N1 = coarsest.at_particles(touched_C[:, None])
-        if share_N is not None:
-            gate_N1 = share_N[:, None] * gate_N1
+        coarsest, corner_83 = grid.coarsest, CORNER_83.to(contact_C.device)
+        gate_N1 = coarsest.at_particles(contact_C[:, None])
+        if weight_N is not None:
+            gate_N1 = weight_N[:, None] * gate_N1
         first_G = coarsest.centre_G8[:, 0]
         scene_N, coordinate_N3 = (x[first_G[grid.groups.group_N]] for x in unpack(grid.levels[-1].key_C))
         place_N3 = coarsest.place_N3 + coarsest.offset_G83[:, 0].expand(first_G.shape[0], 3)[grid.groups.group_N]
@@ -179,7 +179,7 @@ class Deformation:
 def rest(
     acceleration_N3: torch.Tensor,
     state: ParticleState,
-    touched_C: torch.Tensor,
+    contact_C: torch.Tensor,
     grid: GridHierarchy,
     threshold: float,
     scale: torch.Tensor,
@@ -192,7 +192,7 @@ def rest(
     widely_N = widely_M[state.material_N]
     limit_N = ((threshold / scale) ** 2 * state.gravity_S3.square().sum(-1))[state.scene_N]
     for level in range(REST_SIZES):
-        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT, widely_N if level else None)
+        deformation = Deformation(contact_C, grid, level * LEVEL_SHIFT, widely_N if level else None)
         # gravity is equal for all particles of a scene, so P removes it
         rate_N3 = deformation(acceleration_N3 + state.velocity_NM3[:, 0] / scale)
         acceleration_N3 = acceleration_N3 - deformation(slow(rate_N3, limit_N))

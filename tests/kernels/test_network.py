@@ -51,12 +51,15 @@ def assert_features(network, state, found):
         own += physics_NK.shape[1]
     assert not feature_NF[:, own:].any()
     assert feature_NF.shape[1] == (32 if width + materials + sum(physics_widths(network.config)) <= 32 else 64)
-    expected_C2 = torch.stack([contacts.disturbed_C, contacts.touched_C], 1)
+    expected_C2 = torch.stack([contacts.disturbed_C, contacts.contact_C], 1)
     # Cells that bodies divide have other numbers there.
     coarsest_N8 = found.engine.grid.coarsest_N8[: len(state.position_N3)].cpu().long()
     listed_N8 = coarsest_N8 >= 0
-    felt_C2, cell_K = found.engine.grid.felt_C2.cpu().double(), grid.coarsest.centre_G8[grid.groups.group_N][listed_N8]
-    torch.testing.assert_close(felt_C2[coarsest_N8[listed_N8]], expected_C2[cell_K], rtol=0, atol=1e-3)
+    most_C2, cell_K = (
+        found.engine.grid.spread_C2.cpu().double(),
+        grid.coarsest.centre_G8[grid.groups.group_N][listed_N8],
+    )
+    torch.testing.assert_close(most_C2[coarsest_N8[listed_N8]], expected_C2[cell_K], rtol=0, atol=1e-3)
     assert len(cell_K.unique()) == len(expected_C2)
 
 
@@ -87,7 +90,7 @@ def test_cases_are_what_they_say():
     contacts = network.relative_features(state, grid)[1]
     scene_C = unpack(grid.levels[-1].key_C)[0]
     most = [float(contacts.disturbed_C[scene_C == scene].max()) for scene in range(3)]
-    assert most[0] < 1e-3 < most[1] < 0.5 < most[2] and not contacts.touched_C.any()
+    assert most[0] < 1e-3 < most[1] < 0.5 < most[2] and not contacts.contact_C.any()
 
 
 @pytest.mark.parametrize("precision", ["fp32", "fp16"] if device().type == "cpu" else ["fp32", "tf32", "fp16"])

@@ -130,7 +130,7 @@ def test_momentum_is_kept_where_nothing_touches(levels):
             assert float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * sizes
     grid = network.grid(state)
     contacts = network.relative_features(state, grid)[1]
-    assert not contacts.touched_C.any()
+    assert not contacts.contact_C.any()
     stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
     pushed_N3 = balanced(stressed, contacts, grid)
     assert float(pushed_N3.abs().max()) > 1e-2

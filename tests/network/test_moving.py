@@ -15,7 +15,7 @@ from hgn.data.batch import make_batch
 from hgn.network.barriers import Barriers
 from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import surface_gate
+from hgn.network.relative import particle_contact
 from hgn.runtime.differentiable import Pose
 from hgn.runtime.live import LiveSimulation
 from hgn.runtime.simulator import InitialState, Simulator
@@ -127,7 +127,7 @@ def test_contact_where_normals_almost_cancel(distance, expected):
     """In cells of two obstacles a sum of normals may be short. Only with distances a short normal is far away."""
     wall_N6, normal_N6 = torch.zeros(4, 6), torch.zeros(4, 6)
     normal_N6[0, 1], normal_N6[1, 3], wall_N6[2, 0] = 0.1, -0.8, 0.3
-    torch.testing.assert_close(surface_gate(wall_N6, normal_N6, distance), torch.tensor(expected))
+    torch.testing.assert_close(particle_contact(wall_N6, normal_N6, distance), torch.tensor(expected))
 
 
 def test_symmetries_of_the_cube():

@@ -45,11 +45,11 @@ def test_momenta_stay_and_energy_never_grows(body, levels, widely_1, threshold):
     """Of a body over many cells, of lines, planes and points, whatever moves: momentum and angular momentum are as
     without rest to rounding, and the next displacements have at most the energy that they had."""
     place_N3 = [*ODD_BODIES, torch.cat([within_a_cell(), 4 * within_a_cell(80) - 1.6])][body]
-    state, grid, touched_C = on_cells(place_N3, levels)
+    state, grid, contact_C = on_cells(place_N3, levels)
     velocity_N13 = drawn_outputs(len(place_N3))[:, None, 3:6] + torch.tensor([3.0, 0.0, 1.0])
     state = replace(state, velocity_NM3=velocity_N13)
     acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
-    found_N3 = rest(acceleration_N3, state, touched_C, grid, threshold, ONE, widely_1)
+    found_N3 = rest(acceleration_N3, state, contact_C, grid, threshold, ONE, widely_1)
     change_N3 = found_N3 - acceleration_N3
     assert float(change_N3.sum(0).abs().max()) < 1e-11
     assert float(torch.linalg.cross(place_N3 - 0.4, change_N3).sum(0).abs().max()) < 1e-11
@@ -77,7 +77,7 @@ def test_a_pile_comes_to_rest(shift):
     at any place. Without pushes it comes to rest. Without the constraint the deformation grows and stays. Rigid motion
     is unchanged, and so is a deformation faster than 1.5 times the threshold."""
     place_N3 = within_a_cell() * 0.7 + shift
-    state, grid, touched_C = on_cells(place_N3)
+    state, grid, contact_C = on_cells(place_N3)
     rate_13 = torch.tensor([[9.0, 3.0, 5.0]]).double()
     turning_N3 = torch.linalg.cross(rate_13, place_N3 - place_N3.mean(0))
     rigid_N3 = torch.tensor([0.5, -2.0, 0.1]).double() + turning_N3
@@ -85,15 +85,15 @@ def test_a_pile_comes_to_rest(shift):
     for threshold in (0.0, 0.3):
         velocity_N3, generator = rigid_N3, torch.Generator().manual_seed(1)
         push_N3 = 0.02 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
-        push_N3 -= Deformation(0 * touched_C, grid)(push_N3) + push_N3.mean(0)
+        push_N3 -= Deformation(0 * contact_C, grid)(push_N3) + push_N3.mean(0)
         for frame in range(60):
             moving = replace(state, velocity_NM3=velocity_N3[:, None])
             push_N3 = push_N3 * (frame < 40)
-            velocity_N3 = velocity_N3 + rest(push_N3, moving, touched_C, grid, threshold, ONE, NONE_1)
-            sizes[threshold, frame] = float(Deformation(touched_C, grid)(velocity_N3).norm(dim=1).max())
+            velocity_N3 = velocity_N3 + rest(push_N3, moving, contact_C, grid, threshold, ONE, NONE_1)
+            sizes[threshold, frame] = float(Deformation(contact_C, grid)(velocity_N3).norm(dim=1).max())
     assert sizes[0.0, 39] > 0.5 and sizes[0.0, 59] == pytest.approx(sizes[0.0, 39])
     assert max(sizes[0.3, frame] for frame in range(60)) < 0.12 and sizes[0.3, 59] < 1e-3
     moving = replace(state, velocity_NM3=rigid_N3[:, None])
-    torch.testing.assert_close(rest(rigid_N3, moving, touched_C, grid, 0.3, ONE, NONE_1), rigid_N3, rtol=0, atol=1e-12)
+    torch.testing.assert_close(rest(rigid_N3, moving, contact_C, grid, 0.3, ONE, NONE_1), rigid_N3, rtol=0, atol=1e-12)
     swift_N3 = 100 * drawn_outputs(30)[:, :3]
-    torch.testing.assert_close(rest(swift_N3, moving, touched_C, grid, 0.3, ONE, NONE_1), swift_N3, rtol=0, atol=0)
+    torch.testing.assert_close(rest(swift_N3, moving, contact_C, grid, 0.3, ONE, NONE_1), swift_N3, rtol=0, atol=0)

@@ -60,13 +60,13 @@ def _product(matrix, vector):
 
 @triton.jit
 def removed_along(
-    friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT: tl.constexpr
+    friction, fraction, cell, there, inverse, ratio, matrix, disturbed, contact, along, impulse, OUT: tl.constexpr
 ):
     """Returns the part of T = Q R that surfaces remove, (1 - k) T. `along` is T, and `impulse` A without the factor d.
 
     Writes to `fraction` [C, OUT] for the backward pass: T, k, and the derivatives of k by R and by A, both times c.
     """
-    c = disturbed * touched
+    c = disturbed * contact
     force = c * along[0], c * along[1], c * along[2]
     x, y, z = three_columns(friction, cell, 12, there, inverse, OUT)
     variance = tl.load(friction + cell * OUT + 15, mask=there, other=0.0) * inverse - (x * x + y * y + z * z)

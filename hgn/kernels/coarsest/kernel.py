@@ -27,20 +27,20 @@ def _coarsest_places(place_of, row, live):
 
 @triton.jit
 def sum_coarsest(
-    x, coarsest_of, cell_weight_of, place_of, neighbour, counts, disturbed, felt, sums, particle_count, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr,
+    x, coarsest_of, cell_weight_of, place_of, neighbour, counts, disturbed, spread, sums, particle_count, capacity,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, SPREAD: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the first USED columns of the rows of x [N, OUT], with their weights, to the coarsest cells' sums [C, OUT].
 
-    The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL the kernel also writes
-    the disturbance of coarsest cells to felt [C, 2] (`most_around`). Programs cover particles and coarsest cells.
+    The next three columns are the moments of columns 0 to 2 about the cells' middles. With SPREAD the kernel writes
+    the disturbance of coarsest cells to spread [C, 2] too (`most_around`). Programs cover particles and coarsest cells.
 
     Rule: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    if FEEL:
-        most_around(disturbed, felt, 0, neighbour, row, row < tl.load(counts + LEVELS - 1), capacity)
+    if SPREAD:
+        most_around(disturbed, spread, 0, neighbour, row, row < tl.load(counts + LEVELS - 1), capacity)
     live = row < tl.load(particle_count)
     cell, cell_weight = coarsest_cells(coarsest_of, cell_weight_of, row, live)
     px, py, pz = _coarsest_places(place_of, row, live)
@@ -92,7 +92,7 @@ def _pairs(
 
 @triton.jit
 def balance(
-    sums, moments, felt, motion, neighbour, geometry, counts, table, friction, fraction, capacity, few, rare,
+    sums, moments, spread, motion, neighbour, geometry, counts, table, friction, fraction, capacity, few, rare,
     LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the table [C, OUT] of the coarsest cells from sums of particles' outputs.
@@ -115,9 +115,9 @@ def balance(
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
-    disturbed, touched = _felt(felt, cell, there)
-    free = 1 - touched
-    half = 0.5 * tl.load(felt + other * 2, mask=other >= 0, other=0.0)
+    disturbed, contact = _disturbance(spread, cell, there)
+    free = 1 - contact
+    half = 0.5 * tl.load(spread + other * 2, mask=other >= 0, other=0.0)
     mean = three_columns(sums, cell, 0, there, inverse, OUT)
     moment = three_columns(sums, cell, DECODED, there, inverse, OUT)
     lever = cross(centre, mean)
@@ -146,19 +146,19 @@ def balance(
         for i in tl.static_range(3):
             impulse = impulse + (tl.sum(share * (felt_by * traction[i] + swing[i]), 1),)  # noqa: RUF005
         along = removed_along(
-            friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT
+            friction, fraction, cell, there, inverse, ratio, matrix, disturbed, contact, along, impulse, OUT
         )  # fmt: skip
     for i in tl.static_range(3):
         pushed = tl.sum(share * (felt_by * traction[i] + swing[i]), 1) - free * known * mean[i]
-        pushed -= touched * along[i]
+        pushed -= contact * along[i]
         tl.store(line + i, disturbed * pushed - lever[i], mask=there)
         tl.store(line + 4 + i, turn[i], mask=there)
-    tl.store(line + 3, disturbed * (touched + free * known), mask=there)
+    tl.store(line + 3, disturbed * (contact + free * known), mask=there)
 
 
 @triton.jit
 def balance_backward(
-    sums, moments, felt, motion, neighbour, geometry, counts, table, friction, fraction, capacity, few, rare,
+    sums, moments, spread, motion, neighbour, geometry, counts, table, friction, fraction, capacity, few, rare,
     LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the table [C, OUT] from sums of gradients of the result of `balance` and of their moments.
@@ -177,9 +177,9 @@ def balance_backward(
     other, beside, axis, sign, part, both, middle, apart, whole = _pairs(
         moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
     )
-    disturbed, touched = _felt(felt, cell, there)
-    free = 1 - touched
-    half = 0.5 * tl.load(felt + other * 2, mask=other >= 0, other=0.0)
+    disturbed, contact = _disturbance(spread, cell, there)
+    free = 1 - contact
+    half = 0.5 * tl.load(spread + other * 2, mask=other >= 0, other=0.0)
     # The code above depends only on places.
     if OVERLAP:
         gdc_wait()
@@ -201,12 +201,12 @@ def balance_backward(
         by_mean = three_columns(fraction, cell, 4, there, 1.0, OUT)
     for i in tl.static_range(3):
         own = factor * known * mean[i] - lever[i]
-        own -= disturbed * touched * along[i]
+        own -= disturbed * contact * along[i]
         if FRICTION:
-            own += k * disturbed * touched * along[i] + slope * by_mean[i]
+            own += k * disturbed * contact * along[i] + slope * by_mean[i]
         tl.store(line + i, own, mask=there)
         tl.store(line + 10 + i, turn[i], mask=there)
-    tl.store(line + 9, disturbed * (touched + free * known), mask=there)
+    tl.store(line + 9, disturbed * (contact + free * known), mask=there)
     their_mean = three_columns(sums, other, 0, other >= 0, beside, OUT)
     their_moment = three_columns(sums, other, 3, other >= 0, beside, OUT)
     lever = cross(middle, their_mean)
@@ -243,9 +243,9 @@ def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.conste
 
 
 @triton.jit
-def _felt(felt, cell, there):
-    """Returns the disturbance of cells (column 0 of `felt`), and their disturbance by surfaces (column 1)."""
-    return tl.load(felt + cell * 2, mask=there, other=0.0), tl.load(felt + cell * 2 + 1, mask=there, other=0.0)
+def _disturbance(spread, cell, there):
+    """Returns the disturbance of cells (column 0 of `spread`), and their disturbance by surfaces (column 1)."""
+    return tl.load(spread + cell * 2, mask=there, other=0.0), tl.load(spread + cell * 2 + 1, mask=there, other=0.0)
 
 
 @triton.jit

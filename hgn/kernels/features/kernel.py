@@ -21,12 +21,12 @@ STRETCH, NEIGHBOURS = tl.constexpr(elastic.STRETCH), tl.constexpr(rest_shape.NEI
 
 @triton.jit
 def sum_motion(
-    motion, parent, geometry, counts, disturbed, felt, neighbour, drift, coarsest_capacity,
+    motion, parent, geometry, counts, disturbed, spread, neighbour, drift, coarsest_capacity,
     LEVELS: tl.constexpr, MOVING: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
 
-    A second set of programs writes the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`), and
+    A second set of programs writes the nearness of surfaces to the coarsest cells' `spread` [C, 2] (`most_around`), and
     with MOVING the mean V (hgn.network.moving) of a cell and those across its faces to columns 4 to 6 of `drift`.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
@@ -40,7 +40,7 @@ def sum_motion(
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if tl.program_id(1) == 1:  # these programs run at the same time as those of the sums
         there = cell < tl.load(counts + LEVELS - 1)
-        most_around(disturbed, felt, 1, neighbour, cell, there, coarsest_capacity)
+        most_around(disturbed, spread, 1, neighbour, cell, there, coarsest_capacity)
         if MOVING > 0:
             x, y, z = three_columns(drift, cell, 0, there, 1.0, 8)
             contacts = tl.load(drift + cell * 8 + 3, mask=there, other=0.0)
@@ -178,7 +178,7 @@ def _add_slip(v, gravity, scale, scene, live, cell, cell_weight, sums, COLUMNS: 
 @triton.jit
 def prepare_relative_features(
     velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, cell_weight_of,
-    motion, parent, geometry, features, touch_of, disturbed, felt, parameter_of, surface_of, drift, friction, quiet,
+    motion, parent, geometry, features, contact_of, disturbed, spread, parameter_of, surface_of, drift, friction, quiet,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, FRICTION: tl.constexpr,
     FRICTION_AT: tl.constexpr, PARAMETERS: tl.constexpr, PARAMETERS_AT: tl.constexpr, MOVING: tl.constexpr,
     COLUMNS: tl.constexpr, FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
@@ -186,7 +186,7 @@ def prepare_relative_features(
     """Writes each particle's relative features [N, FEATURES], which neither a boost nor a shift changes.
 
     They are: changes of velocity minus gravity; the velocity relative to the cells around on each level, whose mass and
-    momentum are in `motion`; near a surface the velocity, weighted by `felt` of the coarsest cells; the columns of
+    momentum are in `motion`; near a surface the velocity, weighted by `spread` of the coarsest cells; the columns of
     surfaces and the FRICTION columns from FRICTION_AT on, which prepare_particles wrote; the one-hot material; and the
     PARAMETERS columns of `parameter_of` from PARAMETERS_AT on. Velocities are written as asinh(velocity / `scale`).
     The kernel raises column 0 of the coarsest cells' `disturbed` [C, 2] to their particles' disturbance, times FULLY.
@@ -233,18 +233,18 @@ def prepare_relative_features(
             cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
     is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)
-    touch = tl.load(touch_of + row, mask=live, other=0.0)
+    contact = tl.load(contact_of + row, mask=live, other=0.0)
     coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
     cell_weight = tl.load(cell_weight_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
-    gate_part = cell_weight * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0)
+    gate_part = cell_weight * tl.load(spread + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0)
     gate = tl.sum(gate_part, 1)
     if MOVING > 0:
         around = three_columns(drift, coarsest, 4, coarsest >= 0, one_over(gate)[:, None] * gate_part, 8)
-        surface = three_columns(surface_of, row, 0, live, touch, 3)
+        surface = three_columns(surface_of, row, 0, live, contact, 3)
         slip = three_columns(velocity, row, 0, live, 1.0, 3 * HISTORY)
         relative = ()
         for i in tl.static_range(3):
-            own = slip[i] - (surface[i] + (1 - touch) * tl.sum(around[i], 1))
+            own = slip[i] - (surface[i] + (1 - contact) * tl.sum(around[i], 1))
             relative = relative + (own,)  # noqa: RUF005 - Triton does not support unpacking here
             v = with_column(v, CONTACT + i, own)
         if FRICTION > 0:
@@ -253,7 +253,7 @@ def prepare_relative_features(
     value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
     value = tl.where(is_contact, value * gate[:, None], value)
     moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
-    raise_disturbed(disturbed, coarsest, tl.minimum(touch + tl.sum(moved * moved, 1), 1.0))
+    raise_disturbed(disturbed, coarsest, tl.minimum(contact + tl.sum(moved * moved, 1), 1.0))
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
     own = (column < WALLS) | (column >= MATERIAL)

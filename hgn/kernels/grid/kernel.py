@@ -203,16 +203,16 @@ def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
 def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, cell_weight_of, place_of, moments, domain, obstacle_table,
-    obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, instant,
-    surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity, scene_position, scene_velocity,
-    sign, HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
+    obstacle_cell_size, features, contact_of, disturbed, wall_friction, gravity, scale, friction, moving, poses,
+    instant, surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity, scene_position,
+    scene_velocity, sign, HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, REACH: tl.constexpr, FEATURES: tl.constexpr,
     FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, BODIES: tl.constexpr,
     OVERLAP: tl.constexpr, IMAGE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
-    With MOTION (relative inputs) it writes for each particle too: the features of surfaces; its contact `touch_of` [N];
+    With MOTION (relative inputs) it writes for each particle too: the features of surfaces; its contact [N];
     its coarsest cells `coarsest_of` [N, 8], where repeated cells are -1; its weights `cell_weight_of` in them; and
     its place [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the
     finest (`motion` [.., 4]); places, products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
@@ -233,12 +233,12 @@ def prepare_particles(
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
     if MOTION:
-        surfaces, touch, surface = surfaces_of(
+        surfaces, contact, surface = surfaces_of(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses,
             instant, scenes, scene_position, scene_velocity, sign, HISTORY, OBSTACLES, SYMMETRY,
             4 if FRICTION > 0 else 3, REACH, MOVING, IMAGE,
         )  # fmt: skip
-        tl.store(touch_of + row, touch, mask=live)
+        tl.store(contact_of + row, contact, mask=live)
         column = tl.arange(0, 16)[None, :]
         at = features + row[:, None] * FEATURES + (3 * (HISTORY + LEVELS) + column)
         tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS))
@@ -298,16 +298,16 @@ def prepare_particles(
         for i in tl.static_range(6):
             added = tl.where(part == 9 + i, cell_weight[:, :, None] * product[i][:, None, None], added)
         # The added columns are a multiple of four, because the hardware adds four at once.
-        adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
+        adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (contact > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
-        raise_disturbed(disturbed + 1, coarsest, touch)
+        raise_disturbed(disturbed + 1, coarsest, contact)
         if FRICTION > 0:
             add_friction(
                 surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, cell_weight, friction,
                 features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, MOVING, BODIES, COLUMNS,
             )  # fmt: skip
         if MOVING > 0:
-            add_drift(touch, surface, coarsest, cell_weight, drift)
+            add_drift(contact, surface, coarsest, cell_weight, drift)
             for i in tl.static_range(3):
                 tl.store(surface_of + row * 3 + i, surface[i], mask=live)
     if OVERLAP:

@@ -138,10 +138,10 @@ class DeviceGrid:
     status has sticky flags. Methods return neighbour, parent, octant and children of a level as views. Each particle
     has cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF. Relative inputs need more. motion_C4 is
     mass and momentum of the cells of all levels, one level after the other. The coarsest cells have disturbed_C2
-    (disturbed and touched by their own particles, in units of FULLY) and felt_C2 (its maximum over a cell and the cells
-    across its faces). sum_C and table_C are the sums and the table of `balance`. moment_C contains first and second
-    moments of places, and sums of products of normals. A particle has its coarsest cells coarsest_N8 (repeated cells
-    are -1), its weights cell_weight_N8 in them, its place place_N3 in the lowest one, and its contact touch_N. With
+    (disturbance and contact of their own particles, in units of FULLY) and spread_C2 (its maximum over a cell and the
+    cells across its faces). sum_C and table_C are the sums and the table of `balance`. moment_C contains first and
+    second moments of places, and sums of products of normals. A particle has its coarsest cells coarsest_N8 (repeated
+    ones are -1), its weights cell_weight_N8 in them, its place place_N3 in the lowest one, and its contact_N. With
     friction as an input, friction_C are the sums of `add_friction`, and friction_fraction_C is k of `removed_along` and
     its derivatives. `friction` is the number of friction columns of the particles that were prepared last, or 0.
     """
@@ -205,7 +205,7 @@ class DeviceGrid:
         self.coarsest_N8 = integers(particles * relative, 8)
         self.cell_weight_N8 = torch.zeros(particles * relative, 8, device=device)
         self.place_N3 = torch.zeros(particles * relative, 3, device=device)
-        self.touch_N = torch.zeros(particles * relative, device=device)
+        self.contact_N = torch.zeros(particles * relative, device=device)
         self.surface_N3 = torch.zeros(particles * (drifting > 0), 3, device=device)
         self.drift_C8 = drift.view(torch.float32).view(-1, 8)
         self.motion_C4, self.moment_C = motion.view(torch.float32).view(-1, 4), moments.view(torch.float32)
@@ -213,7 +213,7 @@ class DeviceGrid:
             x.view(torch.float32).view(-1, SUMS) for x in (*sums, friction)
         )
         self.disturbed_C2 = disturbed.view(-1, 2)
-        self.felt_C2 = torch.zeros(coarsest, 2, device=device)
+        self.spread_C2 = torch.zeros(coarsest, 2, device=device)
         self.table_C, self.friction_fraction_C = (torch.zeros(rows, SUMS, device=device) for rows in (coarsest, rough))
         self._at = [row[6] for row in rows]
 
@@ -324,9 +324,9 @@ class DeviceGrid:
             origin=particles.origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
             fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
-            cell_weight_of=self.cell_weight_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
-            disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
-            gravity=seen.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
+            cell_weight_of=self.cell_weight_N8, place_of=self.place_N3, moments=self.moment_C, cell_size=self.cell_size,
+            wall_friction=particles.domain_S3 if walls is None else walls, contact_of=self.contact_N,
+            disturbed=self.disturbed_C2, gravity=seen.gravity_S3, scale=scale[1], friction=self.friction_C,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
             **self._owners, BODIES=self.config.body_cells, REACH=REACH_CELLS if config.obstacle_distance else 0.0,
             MOTION=config.relative, COLUMNS=SUMS, **own_physics, **drift, **arguments_of(moving, particles.count),
@@ -340,7 +340,7 @@ class DeviceGrid:
             return
         feature_kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
             motion=self.motion_C4, parent=self.parents, geometry=self.geometry, counts=self.counts_L,
-            disturbed=self.disturbed_C2, felt=self.felt_C2, neighbour=self.neighbour(self.levels - 1),
+            disturbed=self.disturbed_C2, spread=self.spread_C2, neighbour=self.neighbour(self.levels - 1),
             drift=self.drift_C8, coarsest_capacity=self.capacities[-1], LEVELS=self.levels, MOVING=drift["MOVING"],
             OVERLAP=overlap, BLOCK=MARK_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
@@ -349,8 +349,8 @@ class DeviceGrid:
             gravity=seen.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
             weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, cell_weight_of=self.cell_weight_N8,
             motion=self.motion_C4, parent=self.parents, geometry=self.geometry, features=self.feature_NF,
-            touch_of=self.touch_N, disturbed=self.disturbed_C2, felt=self.felt_C2,
-            parameter_of=self.touch_N if parameter_NP is None else parameter_NP, quiet=QUIET,
+            contact_of=self.contact_N, disturbed=self.disturbed_C2, spread=self.spread_C2,
+            parameter_of=self.contact_N if parameter_NP is None else parameter_NP, quiet=QUIET,
             HISTORY=config.velocity_history,
             LEVELS=self.levels, NORMALS=int(config.obstacle_features), **own_physics,
             PARAMETERS=0 if parameter_NP is None else min(parameter_NP.shape[1], sum(self._widths[1:])),
@@ -379,13 +379,13 @@ class DeviceGrid:
         cells_too = max(particles, capacity) if forward else particles
         # In a backward pass a kernel of another package comes before, so this launch does not overlap with it.
         coarsest_kernel.sum_coarsest[(triton.cdiv(cells_too, PARTICLE_BLOCK),)](
-            x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=sums, USED=taken,
-            FEEL=forward, **sizes, launch_pdl=overlap and forward,
+            x=x, **pairs, **cells, disturbed=self.disturbed_C2, spread=self.spread_C2, sums=sums, USED=taken,
+            SPREAD=forward, **sizes, launch_pdl=overlap and forward,
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
-            sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
-            table=self.table_C, friction=self.friction_C, fraction=self.friction_fraction_C, few=FEW, rare=RARE,
-            FRICTION=self.friction > 0, **sizes, launch_pdl=overlap,
+            sums=sums, spread=self.spread_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C,
+            **cells, table=self.table_C, friction=self.friction_C, fraction=self.friction_fraction_C, few=FEW,
+            rare=RARE, FRICTION=self.friction > 0, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,

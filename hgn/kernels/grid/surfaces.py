@@ -78,8 +78,8 @@ def surfaces_of(
     distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
     value = tl.where(walls, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
     near = tl.max(value, 1)
-    touch = tl.minimum(2 * near, 1.0)
-    surface = touch, touch, touch
+    contact = tl.minimum(2 * near, 1.0)
+    surface = contact, contact, contact
     if OBSTACLES or MOVING > 0:
         # The probes are the present position, and steps along the path to the next frame.
         quarters = tl.arange(0, 8)[None, :]
@@ -94,12 +94,12 @@ def surfaces_of(
             line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
             normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW, REACH)
         else:
-            none = 0.0 * time + 0.0 * touch[:, None]
+            none = 0.0 * time + 0.0 * contact[:, None]
             normal = none, none, none, none
         if MOVING > 0:
             normal = _with_moving(
                 normal, scene_position, scene_velocity, row, live, scene, moving, poses, instant, scenes,
-                time + 0.0 * touch[:, None], asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, REACH, MOVING,
+                time + 0.0 * contact[:, None], asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, REACH, MOVING,
             )  # fmt: skip
         if IMAGE:
             shown = ()
@@ -117,15 +117,15 @@ def surfaces_of(
             for first in tl.static_range(6, 12, 3):
                 of_normal = (column >= first)[None, :] & (column < first + 3)[None, :]
                 near = tl.maximum(near, tl.sqrt_rn(tl.sum(tl.where(of_normal, value * value, 0.0), 1)))
-            touch = tl.minimum(2 * near, 1.0)
+            contact = tl.minimum(2 * near, 1.0)
         else:
-            touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
+            contact = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, contact)
         if MOVING > 0:
             here = tl.max((found & (quarters == 0)).to(tl.int32), 1) > 0
             met = found & (quarters == tl.where(here, 0, ahead)[:, None])
             surface = tl.sum(tl.where(met, normal[4], 0.0), 1), tl.sum(tl.where(met, normal[5], 0.0), 1)
             surface = surface + (tl.sum(tl.where(met, normal[6], 0.0), 1),)  # noqa: RUF005
-    return value, touch, surface
+    return value, contact, surface
 
 
 @triton.jit
@@ -200,13 +200,13 @@ def add_friction(
 
 
 @triton.jit
-def add_drift(touch, surface, cell, cell_weight, drift):
+def add_drift(contact, surface, cell, cell_weight, drift):
     """Adds contact times V to columns 0 to 2 of the coarsest cells' `drift` [C, 8], and the contact to column 3."""
     column = tl.arange(0, 4)[None, :]
-    value = tl.where(column == 3, touch[:, None], 0.0)
+    value = tl.where(column == 3, contact[:, None], 0.0)
     for i in tl.static_range(3):
-        value = with_column(value, i, touch * surface[i])
-    there = ((cell >= 0) & (touch > 0)[:, None])[:, :, None] & (column >= 0)[:, None, :]
+        value = with_column(value, i, contact * surface[i])
+    there = ((cell >= 0) & (contact > 0)[:, None])[:, :, None] & (column >= 0)[:, None, :]
     at = drift + cell[:, :, None] * 8 + column[:, None, :]
     tl.atomic_add(at, cell_weight[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
 

@@ -79,8 +79,8 @@ def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.con
 
 @triton.jit
 def sum_displacements(
-    x, velocity, scale, material_of, coarsest_of, cell_weight_of, place_of, felt, slot_of_cell, geometry, low, base_of,
-    gate_of, spot_of, sums, particle_count,
+    x, velocity, scale, material_of, coarsest_of, cell_weight_of, place_of, spread, slot_of_cell, geometry, low,
+    base_of, gate_of, spot_of, sums, particle_count,
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, RESTING: tl.constexpr,
     COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -96,7 +96,7 @@ def sum_displacements(
     live = row < tl.load(particle_count)
     line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
     cell, cell_weight = coarsest_cells(coarsest_of, cell_weight_of, row, live)
-    gate = tl.sum(cell_weight * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
+    gate = tl.sum(cell_weight * tl.load(spread + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
     if RESTING != -1:
         gate *= (RESTING >> tl.load(material_of + row, mask=live, other=0) & 1).to(tl.float32)
     own = tl.load(coarsest_of + row * 8, mask=live, other=-1)

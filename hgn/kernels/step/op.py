@@ -85,7 +85,7 @@ class DeviceStep:
             tables = {"bodies": own.bodies, "table": own.table, "count": len(own.table), "BODIES": SUMS}
             kernel.sum_displacements[blocks](
                 **pairs, **moving, **sizes, coarsest_of=grid.coarsest_N8, cell_weight_of=grid.cell_weight_N8,
-                place_of=grid.place_N3, felt=grid.felt_C2, slot_of_cell=grid.slot_of_cell, low=grid.low,
+                place_of=grid.place_N3, spread=grid.spread_C2, slot_of_cell=grid.slot_of_cell, low=grid.low,
                 sums=own.bodies, SHIFT=level * LEVEL_SHIFT, material_of=particles.material_N,
                 RESTING=self._widely if level else -1, COLUMNS=SUMS,
             )  # fmt: skip
