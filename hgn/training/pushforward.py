@@ -1,15 +1,10 @@
 """Pushforward: the network simulates, and learns to return from the simulated states to the data.
 
-The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger (Ross et al. 2011):
-
-1. Before a command's first update, and before each update whose number is a multiple of `pushforward_every`, the
-   present parameters (or their moving average) simulate `pushforward_scenes` scenes, each from a random frame of the
-   data. A simulation has `simulated_frames`, or fewer if the episode ends earlier.
-2. Each simulated frame becomes a window in a pool. A fraction of the samples of later updates comes from the pool.
-
-Noise shows the network random errors. The network's own errors are biased, and similar for all particles of a body.
-Seed, update and rank determine all draws. The pool is not part of a checkpoint, so a resumed training simulates again.
-Its updates are those of an uninterrupted training if the checkpoint is at a multiple of `pushforward_every`.
+The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger (Ross et al. 2011). The rules are in
+docs/concepts/training.md. Noise shows the network random errors. Its own errors are biased, and similar for all
+particles of a body. Seed, update and rank determine all draws. The pool is not part of a checkpoint, so a resumed
+training simulates again. Its updates are those of an uninterrupted training if the checkpoint is at a multiple of
+`pushforward_every`.
 
 This module contains the pool, pushforward_targets the targets; torch_pushforward and triton_pushforward simulate.
 Shape legend: H velocity history, F simulated frames, T = H + F + 2 frames of the data, W = H + 2 frames of a window,
