@@ -1,8 +1,8 @@
 """Pushforward: the network simulates, and learns to return from the simulated states to the data.
 
 The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger (Ross et al. 2011). The rules are in
-docs/concepts/training.md. Noise shows the network random errors. Its own errors are biased, and similar for all
-particles of a body. Seed, update and rank determine all draws. The pool is not part of a checkpoint, so a resumed
+docs/concepts/training.md. Noise shows the network random errors. The network's own errors are biased, and similar for
+all particles of a body. Seed, update and rank determine all draws. The pool is not part of a checkpoint, so a resumed
 training simulates again. Its updates are those of an uninterrupted training if the checkpoint is at a multiple of
 `pushforward_every`.
 
