@@ -94,8 +94,6 @@ def main(mapping: dict[str, Any]) -> int:
         precompilation = precompile_kernels(config, resume, stack)
         store = wait_for_episodes(config, generator, stop, others)
         if store is None:
-            lost = "finished scenes are kept, interrupted simulations start again"
-            print(f"stopped before the first episode was published; {lost}; the same command resumes", file=sys.stderr)
             return stop.exit_code
         missing = missing_scenes(config, store.manifest, ("train", "validation"))
         if first_rank() and generator is None and missing:

@@ -90,7 +90,8 @@ def wait_for_episodes(
 
     While the generator runs, it also waits for the first validation episode: otherwise a short training might end
     before one is published, without a best checkpoint.
-    Returns None after a stop request. Once the manifest has been read, later reads may fail for the standard patience.
+    Returns None after a stop request; it then ends the generator, and prints what is missing and kept. Once the
+    manifest has been read, later reads may fail for the standard patience.
     Raises: ConfigError if the generator failed, or if no process generates the missing episodes.
     """
     folder = config.dataset.folder
@@ -104,9 +105,9 @@ def wait_for_episodes(
             f"dataset.folder must contain a data set, got {folder} without one; generate it with python -m datagen "
             f"out={folder}, or set training.generate=true"
         )
-    progress, seen_s = None, -math.inf
+    progress, seen_s, missing = None, -math.inf, ""
     with contextlib.ExitStack() as shown:  # closes the bar
-        while not stop.requested:
+        while not (missing and stop.requested):
             # read before the manifest, which then has all episodes of a generator that has ended
             running = generator is not None and generator.running
             try:
@@ -118,33 +119,48 @@ def wait_for_episodes(
                 time.sleep(0.5)
                 continue
             awaited = min(1, validation) if running else 0
-            if store is not None and len(store) >= needed and store.manifest.published("validation") >= awaited:
+            train, validated = (len(store), store.manifest.published("validation")) if store is not None else (0, 0)
+            missing = f"{max(0, needed - train)} training and {max(0, awaited - validated)} validation scenes"
+            if stop.requested:
+                break
+            if store is not None and train >= needed and validated >= awaited:
                 if progress is not None:
                     progress.close()
                     frames = 0 if generator is None else generator.frames_done()
-                    if frames:
-                        print(estimate(config, frames, progress.format_dict["elapsed"]), file=sys.stderr)
+                    if generator is not None and frames:
+                        present, seconds = generator.present + generator.found, progress.format_dict["elapsed"]
+                        print(estimate(config, frames, present, seconds), file=sys.stderr)
                 return PooledStore(store, others) if others else store
             if generator is not None:
                 if not running:
                     generator.check()
                     raise ConfigError(
                         f"training.minimum_episodes must be reachable, got {needed} for a data set of "
-                        f"{len(store) if store else 0}; generate more scenes"
+                        f"{train}; generate more scenes"
                     )
             elif first_rank() and (not is_remote(folder) or (store is not None and store.manifest.complete)):
                 raise ConfigError(
-                    f"dataset.folder must contain {needed} training episodes, got {len(store) if store else 0} in "
+                    f"dataset.folder must contain {needed} training episodes, got {train} in "
                     f"{folder}; generate them, or set training.generate=true"
                 )
             if progress is None and first_rank():
-                text = f"waiting for {needed} training and {awaited} validation episodes in {folder}"
-                print(printable(text), file=sys.stderr)
+                print(printable(f"waiting for {missing} in {folder}"), file=sys.stderr)
                 total = (needed + validation) * config.dataset.frames
-                progress = shown.enter_context(bar("generating", total=total, unit="frame"))
+                initial = (min(train, needed) + min(validated, validation)) * config.dataset.frames
+                progress = shown.enter_context(bar("generating", total, initial, "frame"))
             if progress is not None and generator is not None:
-                advance_to(progress, min(max(generator.frames_done(), progress.n), progress.total))
+                frames = progress.initial + generator.frames_done() + generator.found * config.dataset.frames
+                advance_to(progress, min(max(frames, progress.n), progress.total))
             time.sleep(0.5)
+    kept = sum(map(store.manifest.published, SPLITS)) if store is not None else 0
+    lost = ""
+    if generator is not None:
+        generator.stop()
+        kept, lost = max(kept, generator.kept), ", interrupted simulations start again"
+    if first_rank():
+        scenes = sum(map(config.dataset.scenes, SPLITS))
+        text = f"stopped while waiting for {missing}; {kept} of {scenes} scenes {'is' if kept == 1 else 'are'} kept"
+        print(f"{text}{lost}; the same command resumes", file=sys.stderr)
     return None
 
 
@@ -163,13 +179,16 @@ def warning_on_a_cpu(config: TrainConfig, manifest: Manifest | None) -> str | No
     return f"no GPU: {scenes} scenes take roughly {duration(seconds)} and {space} here, {updates}; {WAY_OUT}"
 
 
-def estimate(config: TrainConfig, frames: int, seconds: float) -> str:
-    """Returns the remaining time and the size of the data set, of which `frames` were simulated in `seconds`."""
+def estimate(config: TrainConfig, frames: int, present: int, seconds: float) -> str:
+    """Returns the remaining time and the size of the data set, of which `frames` were simulated in `seconds`.
+
+    `present` episodes were not: earlier runs or other generators made them.
+    """
     folder = Path(config.dataset.folder)
     scenes = sum(config.dataset.scenes(split) for split in SPLITS)
-    present = sum(Manifest.load(folder).published(split) for split in SPLITS)
-    size = scenes * sum(path.stat().st_size for path in folder.glob("*-*.tar")) / present
-    left_s = max(0.0, scenes * config.dataset.frames / frames - 1) * seconds
+    published = sum(Manifest.load(folder).published(split) for split in SPLITS)
+    size = scenes * sum(path.stat().st_size for path in folder.glob("*-*.tar")) / published
+    left_s = max(0.0, (scenes - present) * config.dataset.frames / frames - 1) * seconds
     space = f"{size / 1e9:.2g} GB in all, {disk_usage(folder).free / 1e9:.2g} GB are free"
     return f"about {duration(left_s)} for the rest of {scenes} scenes, while training continues; {space}"
 

@@ -29,6 +29,8 @@ class Generator:
         (folder / "dataset.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
         self.log_path = folder / "datagen.log"
         self._read_to = self._finished = self._frames_per_episode = 0
+        self.present = 0  # episodes published before the start
+        self.found = 0  # episodes that an earlier run staged, or another generator published
         self._running: dict[int, int] = {}  # frames of each worker's present launch
         command = (sys.executable, "-m", "datagen", "--config-path", str(folder.resolve()), "--config-name", "dataset")
         with self.log_path.open("wb") as log:
@@ -46,8 +48,14 @@ class Generator:
                 message = last_message(log)
             raise ConfigError(f"the generator ended with exit code {code}: {message} (log: {self.log_path})")
 
+    @property
+    def kept(self) -> int:
+        """Number of episodes that are published or staged. Reads the log."""
+        self.frames_done()
+        return self.present + self.found + self._finished
+
     def frames_done(self) -> int:
-        """Returns the frames simulated since the start, including those of running episodes."""
+        """Returns the frames simulated since the start, including those of running episodes. Reads the log."""
         with self.log_path.open("rb") as log:
             log.seek(self._read_to)
             for line in log:
@@ -60,11 +68,13 @@ class Generator:
 
     def _note(self, record: dict[str, Any]) -> None:
         if record["event"] == "start":
-            self._frames_per_episode = record["frames"]
+            self._frames_per_episode, self.present = record["frames"], record["done"]
         elif record["event"] == "frame":
             self._running[record["worker"]] = record["frame"] * record["scenes"]
         elif record["event"] == "episode":
             self._finished += 1
+        elif record["event"] == "found":
+            self.found += record["count"]
 
     def stop(self) -> None:
         """Ends the process as Ctrl-C does. Finished episodes are kept, and a later start continues."""

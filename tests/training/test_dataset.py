@@ -52,8 +52,10 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     make_dataset(config)
     frames = config.dataset.frames
     scenes = sum(config.dataset.scenes(split) for split in ("train", "validation", "test"))
-    text = estimate(config, frames, 3600.0)
-    assert text.startswith(f"about {scenes - 1} hours for the rest of {scenes} scenes") and " GB are free" in text
+    for present in (0, 2):  # before a resume
+        text = estimate(config, frames, present, 3600.0)
+        assert text.startswith(f"about {scenes - 1 - present} hours for the rest of {scenes} scenes")
+        assert " GB are free" in text
     assert duration(40) == "40 seconds" and duration(61.4 * 86400) == "61 days" and duration(12600) == "3.5 hours"
     monkeypatch.setattr(callbacks, "ESTIMATE_AFTER_S", 0.0)
     monkeypatch.setattr(callbacks, "LONG_ON_A_CPU_S", -1.0)

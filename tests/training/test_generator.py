@@ -1,5 +1,6 @@
 """The generator that a training starts itself: a process of its own, that makes what is missing."""
 
+import signal
 import time
 from dataclasses import replace
 from unittest import mock
@@ -57,6 +58,7 @@ def test_makes_what_is_missing(tmp_path):
     manifest = Manifest.load(config.dataset.folder)
     assert manifest.complete and sum(len(shard.episodes) for shard in manifest.shards) == 3
     assert min(done) == 0 < max(done) <= 9
+    assert generator.kept == 3 and max(done) == 3 * (3 - generator.present)
     for episode in EpisodeStore(config.dataset.folder, "train"):  # the real solver's
         assert episode.solver["counters"]["substeps"] > 0 and len(episode.obstacle_grid.cell_K3) > 0
 
@@ -83,7 +85,7 @@ def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch, ca
     looks = iter((60.0, 65.0))
     start_s = time.time()
     monkeypatch.setattr("hgn.training.dataset.time.sleep", pass_time)
-    generator = mock.Mock(running=True, frames_done=mock.Mock(side_effect=(0, 1, 3)))
+    generator = mock.Mock(running=True, frames_done=mock.Mock(side_effect=(0, 1, 3)), present=0, found=0)
     store.available.side_effect = (False, False, True)
     store.return_value.__len__.return_value = 2
     store.return_value.manifest.published.return_value = 1
@@ -91,10 +93,31 @@ def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch, ca
     monkeypatch.setattr("hgn.training.dataset.estimate", lambda *given: given)
     assert wait_for_episodes(config, generator, stop) is store.return_value
     (progress,) = bars
-    assert str((config, 3, 5.0)) in capsys.readouterr().err
+    assert str((config, 3, 0, 5.0)) in capsys.readouterr().err
     assert progress.total == 3 * 40 and progress.n == 1
     assert progress.format_dict["elapsed"] == pytest.approx(5.0)
     progress.close()
+
+
+def test_a_resumed_wait_counts_the_scenes_that_are_there(make_config, make_dataset, monkeypatch, capsys):
+    """The bar begins with the published scenes that are waited for, and a staged one advances it. The lines at the
+    start and after a stop tell how many scenes are missing and kept."""
+    make_dataset(make_config(training_scenes=1, validation_scenes=0, test_scenes=0))
+    made = make_config(training_scenes=2, validation_scenes=3, test_scenes=0)
+    config = TrainConfig(scene=made.scene, dataset=made.dataset, training=TrainingConfig(minimum_episodes=2))
+    frames, bars, stop = made.dataset.frames, [], StopRequest()
+    monkeypatch.setattr(
+        "hgn.training.dataset.bar", lambda *given, **named: bars.append(bar(*given, **named)) or bars[0]
+    )
+    monkeypatch.setattr("hgn.training.dataset.time.sleep", lambda _: setattr(stop, "signal", signal.SIGINT))
+    generator = mock.Mock(running=True, frames_done=lambda: 1, found=1, kept=2)
+    assert wait_for_episodes(config, generator, stop) is None
+    assert (bars[0].initial, bars[0].n, bars[0].total) == (frames, 2 * frames + 1, 3 * frames)
+    (waiting, stopped) = (line for line in capsys.readouterr().err.splitlines() if "waiting" in line)
+    missing = "waiting for 1 training and 1 validation scenes"
+    assert waiting == f"{missing} in {config.dataset.folder}"
+    assert stopped.startswith(f"stopped while {missing}; 2 of 5 scenes are kept, ")
+    assert generator.stop.called  # before the line
 
 
 def test_waits_for_a_validation_scene(make_config, make_dataset, monkeypatch):
@@ -104,7 +127,7 @@ def test_waits_for_a_validation_scene(make_config, make_dataset, monkeypatch):
     config, looks = make_config(validation_scenes=1, test_scenes=0), []
     few = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     make_dataset(few)
-    ended, generator = mock.Mock(running=False), mock.Mock(running=True, frames_done=lambda: 0)
+    ended, generator = mock.Mock(running=False), mock.Mock(running=True, frames_done=lambda: 0, found=0)
 
     def validation_scenes(config, generator):
         training = TrainConfig(scene=config.scene, dataset=config.dataset)

@@ -281,7 +281,7 @@ def test_faults_while_a_training_waits_for_episodes(data, tmp_path, monkeypatch,
     ends = (lambda: None, lambda: fault.__exit__(None, None, None), lambda: setattr(stop, "signal", signal.SIGTERM))
     steps = iter((fault.__enter__, *ends, again.__enter__))
     monkeypatch.setattr("hgn.training.dataset.time.sleep", lambda _: next(steps)())
-    generator = mock.Mock(running=True, frames_done=lambda: 0)
+    generator = mock.Mock(running=True, frames_done=lambda: 0, found=0, kept=0)
     assert wait_for_episodes(config, generator, stop) is None
     monkeypatch.setenv(VARIABLE, "0")
     stop.signal = None
