@@ -27,8 +27,8 @@ WAY_OUT = (
     "on a CPU: +experiment=demo (minutes), dataset.training_scenes=N with dataset.test_scenes=0 and "
     "training.maximum_updates=N, or a GPU (a hundred times faster)"
 )
-# per particle and frame: CPU seconds of the solver on 64^3 cells (results/start/frame_cpu.json), and bytes in a shard
-SOLVER_CPU_S, SHARD_BYTES = 2.2e-4, 14
+# per particle and frame: CPU seconds of the solver on 64^3 cells (frame_cpu_images.json), and bytes in a shard
+SOLVER_CPU_S, SHARD_BYTES = 1.8e-4, 14
 MEAN_FILLING = 0.7  # mean number of particles of a group, divided by that of a full cube of the group's size
 BETWEEN_LOOKS_S = 10.0  # interval between reads of the manifest for the progress line
 

@@ -88,7 +88,7 @@ def test_long_data_sets_are_announced_before_they_are_made(make_config, tmp_path
     monkeypatch.setattr("hgn.training.dataset.available_cpus", lambda: 2)
     line = warning_on_a_cpu(TrainConfig(dataset=DatasetConfig(folder=str(tmp_path))), None)
     assert line.startswith(
-        "no GPU: 825 scenes take roughly 23 hours and 10 GB here, before most of 20,000,000 updates;"
+        "no GPU: 825 scenes take roughly 19 hours and 10 GB here, before most of 20,000,000 updates;"
     )
     assert "dataset.test_scenes=0" in line
     assert warning_on_a_cpu(make_config(), None) is None
