@@ -24,8 +24,9 @@ from hgn.training.stop import StopRequest
 
 LONG_ON_A_CPU_S = 3600.0
 WAY_OUT = (
-    "on a CPU: +experiment=demo (minutes), dataset.training_scenes=N with dataset.test_scenes=0 and "
-    "training.maximum_updates=N, or a GPU (a hundred times faster)"
+    "on a CPU: +experiment=demo (minutes), a trial (run=runs/trial dataset.folder=data/trial "
+    "dataset.training_scenes=2 dataset.validation_scenes=1 dataset.test_scenes=0 dataset.frames=24 "
+    "training.batch_scenes=1 training.maximum_updates=60), or a GPU (a hundred times faster)"
 )
 # per particle and frame: CPU seconds of the solver on 64^3 cells (frame_cpu_images.json), and bytes in a shard
 SOLVER_CPU_S, SHARD_BYTES = 1.8e-4, 14

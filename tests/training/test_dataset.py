@@ -1,8 +1,11 @@
 """Tests the data set of a training: cost of its scenes, missing scenes, progress, and several data sets."""
 
+import re
+from pathlib import Path
 from unittest import mock
 
 import pytest
+from omegaconf import OmegaConf
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
@@ -16,7 +19,7 @@ from hgn.system.progress import bar, duration
 from hgn.training import callbacks
 from hgn.training.checkpoint import Progress, read_checkpoint
 from hgn.training.data_module import EpisodeDataModule
-from hgn.training.dataset import PublishedEpisodes, estimate, warning_on_a_cpu
+from hgn.training.dataset import WAY_OUT, PublishedEpisodes, estimate, warning_on_a_cpu
 from hgn.training.readers import WindowReader
 
 
@@ -68,6 +71,16 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [3]
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
     assert "for the remaining updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
+
+
+def test_the_trial_that_the_warning_offers_is_that_of_the_tutorial():
+    """It has a run and a data set of its own, and fewer frames than one scene of the main job."""
+    page = (Path(__file__).parents[2] / "docs/tutorials/train.md").read_text()
+    block = next(block for block in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "run: runs/trial" in block)
+    trial = OmegaConf.create(block)
+    offered = OmegaConf.from_dotlist(re.findall(r"(?<=[ (])[a-z_.]+=[\w/]+(?=[ )])", WAY_OUT))
+    assert {"run", "dataset", "training"} == set(offered) and OmegaConf.merge(trial, offered) == trial
+    assert offered.dataset.frames * (offered.dataset.training_scenes + offered.dataset.validation_scenes) < 300
 
 
 @pytest.mark.parametrize(("update", "printed"), [(5, True), (11, False)])
