@@ -58,8 +58,11 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
                 warnings.simplefilter("error", UserWarning)  # Hydra warns of folders that do not exist
                 hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
-            here = initialize_config_dir(str(folder), version_base="1.3")
-            with _strict_files(), registered_dataclasses(folder, config_name), here:
+            with (
+                _strict_files(),
+                registered_dataclasses(folder, config_name),
+                initialize_config_dir(str(folder), version_base="1.3"),  # last: it stays initialised if others fail
+            ):
                 composed.append(compose_once(config_name, arguments[1:]))
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except SystemExit as end:  # Hydra ends with 1 after a message about a missing package

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_624,
+    "hgn": 35_627,
     "datagen": 8_922,
     "tools": 6_278,
-    "tests": 37_576,
+    "tests": 37_578,
 }
 SETTINGS = 235  # fields of the dataclasses behind the commands, *Config
 

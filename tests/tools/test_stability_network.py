@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from docs.pages import run_module
+from hydra.core.global_hydra import GlobalHydra
 from network.states import network_of, silent
 from runtime.stability import family, one_particle, outcome_of, still_weights
 
@@ -262,7 +263,8 @@ def test_the_command_names_its_parts(capfd):
 
 
 def test_a_signal_while_a_part_is_loaded(capfd, monkeypatch):
-    """Ctrl-C during the first seconds, in which PyTorch is loaded, ends in one line."""
+    """Ctrl-C during the first seconds, in which PyTorch is loaded, ends in one line. Hydra can start again."""
     monkeypatch.setattr(importlib, "import_module", mock.Mock(side_effect=KeyboardInterrupt))
     assert run_module("tools.stability", ["solver"]) == 130
     assert capfd.readouterr().err == "error: interrupted\n"
+    assert not GlobalHydra.instance().is_initialized()
