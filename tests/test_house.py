@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 35_627,
+    "hgn": 35_626,
     "datagen": 8_922,
     "tools": 6_278,
     "tests": 37_578,

@@ -259,15 +259,15 @@ class EpisodeStore(Episodes):
         """Returns the result of `use` for a shard's verified file. Options and errors as for `Storage.shard`."""
 
         def bring(files: Storage) -> T:
-            for left in reversed(range(REMOVED_AT_MOST)):
-                try:
-                    return use(files.shard(shard.name, shard.sha256, shard.bytes, **options))
-                except FileNotFoundError:  # another process has removed it from a full cache
-                    if not left:
-                        raise
-            raise AssertionError
+            return use(files.shard(shard.name, shard.sha256, shard.bytes, **options))
 
-        return ask(self.folder, bring)
+        def bring_again(files: Storage) -> T:
+            for _ in range(REMOVED_AT_MOST - 1):
+                with contextlib.suppress(FileNotFoundError):  # another process has removed it from a full cache
+                    return bring(files)
+            return bring(files)
+
+        return ask(self.folder, bring_again)
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)

@@ -127,8 +127,7 @@ def wait_for_episodes(
             if store is not None and train >= needed and validated >= awaited:
                 if progress is not None:
                     progress.close()
-                    frames = 0 if generator is None else generator.frames_done()
-                    if generator is not None and frames:
+                    if generator is not None and (frames := generator.frames_done()):
                         present, seconds = generator.present + generator.found, progress.format_dict["elapsed"]
                         print(estimate(config, frames, present, seconds), file=sys.stderr)
                 return PooledStore(store, others) if others else store
